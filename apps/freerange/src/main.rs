@@ -1,1 +1,67 @@
-fn main() {}
+//! `freerange`: posed photos in, 3D Gaussians out.
+
+mod commands;
+mod error;
+mod output;
+mod pictures;
+mod pipeline;
+mod progress;
+mod runtime;
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+/// Posed photos in, 3D Gaussians out.
+///
+/// From as few as four posed images of an object, a diffusion transformer predicts a compact, complete set of 3D
+/// Gaussians by flow matching. Exit codes: 0 done, 1 failed, 2 bad input.
+#[derive(Parser)]
+#[command(version, max_term_width = 100)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+    /// More messages on standard error (or set RUST_LOG).
+    #[arg(short, long, global = true)]
+    verbose: bool,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Reconstruct an object from posed images.
+    Reconstruct(commands::reconstruct::Args),
+    /// Render a .ply of Gaussians from given cameras.
+    Render(commands::render::Args),
+    /// Measure a method on scenes with validation views.
+    Eval(commands::eval::Args),
+    /// Train a model.
+    Train(commands::train::Args),
+    /// Make and look at training data.
+    #[command(subcommand)]
+    Data(commands::data::Command),
+    /// Look at models.
+    #[command(subcommand)]
+    Model(commands::model::Command),
+}
+
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    let level = if cli.verbose { "debug" } else { "warn" };
+    let filter = tracing_subscriber::EnvFilter::try_from_default_env().unwrap_or_else(|_| level.into());
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    let result = match cli.command {
+        Command::Reconstruct(args) => commands::reconstruct::run(&args),
+        Command::Render(args) => commands::render::run(&args),
+        Command::Eval(args) => commands::eval::run(&args),
+        Command::Train(args) => commands::train::run(&args),
+        Command::Data(command) => commands::data::run(&command),
+        Command::Model(command) => commands::model::run(&command),
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(e) => {
+            eprintln!("error: {e}");
+            ExitCode::from(e.exit_code())
+        }
+    }
+}

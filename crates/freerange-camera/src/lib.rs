@@ -3,5 +3,16 @@
 //! This crate knows nothing of Gaussians.
 
 mod camera;
+mod error;
+mod frame;
+pub mod image_ops;
+mod plucker;
+pub mod scene;
+mod selection;
 
 pub use camera::{Camera, View};
+pub use error::{CameraError, Place};
+pub use frame::{CanonicalFrame, FrameConfig, Similarity, Up, canonical_from_user};
+pub use plucker::{PatchLayout, plucker};
+pub use scene::{Scene, load_cameras};
+pub use selection::{SelectionConfig, ViewSets, k_means, select_views};

@@ -1,1 +1,16 @@
-//! placeholder
+//! Flow matching over Gaussians: the path, the losses, guidance, the solver, and the trainer.
+//!
+//! Start with [`train::step`] (Section 3 of the paper) and [`sample::reconstruct`] (Section 3.5).
+
+pub mod batch;
+pub mod config;
+pub mod coupling;
+mod error;
+pub mod path;
+pub mod photometric;
+pub mod sample;
+pub mod train;
+pub mod trainer;
+mod weights;
+
+pub use error::FlowError;

@@ -1,1 +1,17 @@
-//! placeholder
+//! Image quality: MSE, PSNR, L1, and structural similarity with its gradient.
+//!
+//! Images are flat `[height, width, 3]` slices of `f32` in `[0, 1]`. Every function refuses slices whose
+//! lengths do not match and non-finite pixels never pass as good: they make the result NaN, not a number.
+
+mod error;
+mod pixel;
+mod ssim;
+mod ssim_cropped;
+
+pub use error::MetricsError;
+pub use pixel::{l1, mse, psnr, psnr_from_mse};
+pub use ssim::{photometric_loss, ssim_3dgs, ssim_with_gradient};
+pub use ssim_cropped::{ssim_skimage_gauss, ssim_skimage_sample};
+
+/// Number of colour channels of every image in this crate.
+pub const CHANNELS: usize = 3;

@@ -1,1 +1,28 @@
-//! placeholder
+//! A differentiable rasteriser of 3D Gaussians.
+//!
+//! A Gaussian has 14 channels, in this order: mean (3, world units), natural logarithm of the standard deviation along
+//! each local axis (3), rotation from the local axes to the world's as a quaternion `w x y z` of any length (4), logit of
+//! the opacity, colour (3). Gradients are analytic and reach all 14.
+//!
+//! The image model is that of 3D Gaussian splatting (Kerbl et al. 2023) as gsplat computes it: the projected covariance
+//! is that of the linearised projection plus [`RasterConfig::blur`]; Gaussians are blended from near to far by camera z
+//! (ties in index order); a splat's opacity at a pixel is at most 0.99, and ignored below 1/255; blending stops before the
+//! splat that would take the transmittance to 1e-4 or below.
+//!
+//! * [`rasterize`]: the differentiable operation on tensors, many objects and views in one call.
+//! * [`render`], [`render_backward`]: the same on plain slices, without a tensor library.
+//! * [`mod@reference`]: slow, in f64, for tests.
+
+mod config;
+mod cpu;
+mod error;
+mod op;
+pub mod reference;
+
+pub use config::RasterConfig;
+pub use cpu::{Gradients, RenderOutput, render, render_backward};
+pub use error::RasterError;
+pub use op::rasterize;
+
+/// Channels per Gaussian.
+pub const CHANNELS: usize = 14;

@@ -2,6 +2,23 @@
 //!
 //! This crate knows nothing of tensors, images or cameras: everything downstream builds on it.
 
+mod align;
 mod cloud;
+mod eigen;
+mod error;
+mod file;
+mod merge;
+mod normalize;
+pub mod patch;
+mod ply;
+mod ply_header;
+mod tree;
 
+pub use align::Alignment;
 pub use cloud::{Cloud, channel};
+pub use error::SplatError;
+pub use file::write_atomically;
+pub use merge::{Gaussian, OPACITY_RANGE, merge};
+pub use normalize::{Normalization, STD_FLOOR, Statistics};
+pub use ply::{PlyFile, parse_ply, read_ply, write_ply};
+pub use tree::{LodTree, Node};

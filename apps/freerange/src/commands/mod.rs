@@ -1,0 +1,8 @@
+//! One file per command: its arguments, and what it prints and writes.
+
+pub mod data;
+pub mod eval;
+pub mod model;
+pub mod reconstruct;
+pub mod render;
+pub mod train;

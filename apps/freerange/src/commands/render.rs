@@ -1,0 +1,47 @@
+//! `freerange render`
+
+use std::path::PathBuf;
+
+use freerange_camera::load_cameras;
+use freerange_splat::read_ply;
+
+use crate::{
+    error::CliError,
+    output::OutputFolder,
+    pictures::{render_view, to_picture},
+    progress::Progress,
+};
+
+/// Render a .ply of Gaussians from given cameras: one PNG per frame, on white.
+#[derive(clap::Args)]
+pub struct Args {
+    /// Gaussians as the 3DGS programs write them.
+    file: PathBuf,
+    /// transforms.json, or the folder that holds it; images are not needed where it says `w` and `h`.
+    #[arg(long, value_name = "TRANSFORMS.json")]
+    cameras: PathBuf,
+    /// Where the pictures go.
+    #[arg(short, long, default_value = "renders")]
+    output: PathBuf,
+}
+
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), CliError> {
+    let (cloud, notes) = read_ply(&args.file)?;
+    for note in notes {
+        eprintln!("note: {note}");
+    }
+    let cameras = load_cameras(&args.cameras)?;
+    let output = OutputFolder::create(&args.output)?;
+    let mut bar = Progress::new("rendering", cameras.len() as u64);
+    for (i, (name, camera)) in cameras.iter().enumerate() {
+        let picture = to_picture(&render_view(&cloud, camera)?, camera.width, camera.height);
+        let name = name.rsplit(['/', '\\']).next().unwrap_or("view");
+        output.picture(&format!("{name}.png"), &picture)?;
+        bar.at(i as u64 + 1, name);
+    }
+    bar.finish();
+    output.commit()?;
+    println!("{} pictures in {}", cameras.len(), args.output.display());
+    Ok(())
+}

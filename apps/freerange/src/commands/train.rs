@@ -1,0 +1,66 @@
+//! `freerange train`
+
+use std::{io::Write, path::PathBuf, time::Instant};
+
+use freerange_flow::{config::TrainConfig, trainer::Trainer};
+
+use crate::{
+    error::CliError,
+    progress::Progress,
+    runtime::{DeviceName, checkpoint},
+};
+
+/// Train a model. Run the same command again to go on where it was stopped.
+///
+/// Writes checkpoint.safetensors (averaged weights), log.jsonl (one line per step) and the state to go on from.
+#[derive(clap::Args)]
+pub struct Args {
+    /// Configuration, such as configs/tiny.toml.
+    config: PathBuf,
+    /// Folder of the run.
+    #[arg(short, long)]
+    output: PathBuf,
+    /// Checkpoint whose weights a new run starts from.
+    #[arg(long, value_name = "FILE")]
+    initial: Option<PathBuf>,
+    /// Stop after so many minutes (the state is saved).
+    #[arg(long)]
+    minutes: Option<f64>,
+    /// Steps between two saved states.
+    #[arg(long, default_value_t = 250)]
+    save_every: u64,
+    /// Where to compute.
+    #[arg(long, value_enum, default_value = "auto")]
+    device: DeviceName,
+}
+
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), CliError> {
+    let begin = Instant::now();
+    let device = args.device.open();
+    let config = TrainConfig::load(&args.config)?;
+    let total = config.total_steps();
+    let initial = args.initial.as_deref().map(|path| checkpoint(Some(path), &device)).transpose()?;
+    let mut trainer = Trainer::open(config, &args.output, initial.as_ref(), &device, |m| eprintln!("{m}"))?;
+    let path = args.output.join("log.jsonl");
+    let log = std::fs::File::options().create(true).append(true).open(&path);
+    let mut log = std::io::BufWriter::new(log.map_err(|e| CliError::file(&path, e))?);
+    let mut bar = Progress::new("training", total);
+    while trainer.step_count() < total {
+        let report = trainer.step()?;
+        let line = serde_json::to_string(&report).map_err(CliError::input)?;
+        writeln!(log, "{line}").map_err(|e| CliError::file(&path, e))?;
+        bar.at(report.step, &format!("loss {:.3} flow {:.3} held {:.4} {:.2} s", report.loss, report.flow, report.held, report.seconds));
+        let out_of_time = args.minutes.is_some_and(|m| begin.elapsed().as_secs_f64() > 60.0 * m);
+        if report.step % args.save_every == 0 || report.step == total || out_of_time {
+            log.flush().map_err(|e| CliError::file(&path, e))?;
+            trainer.save()?;
+        }
+        if out_of_time {
+            break;
+        }
+    }
+    bar.finish();
+    println!("{} of {total} steps; {}", trainer.step_count(), args.output.join("checkpoint.safetensors").display());
+    Ok(())
+}

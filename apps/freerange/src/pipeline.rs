@@ -1,0 +1,151 @@
+//! The main job as one function: posed images in the user's frame in, Gaussians in the user's frame out.
+
+use std::time::Instant;
+
+use burn::tensor::Device;
+use freerange_camera::{Frame, Similarity, Up, View, canonical_frame, composite};
+use freerange_fit::{RefineConfig, refine};
+use freerange_flow::sample::{SampleConfig, reconstruct};
+use freerange_metrics::{psnr, ssim_3dgs};
+use freerange_model::Checkpoint;
+use freerange_splat::Cloud;
+use serde::Serialize;
+
+use crate::{
+    error::CliError,
+    pictures::{WHITE, render_view},
+    progress::Progress,
+};
+
+/// What a reconstruction should do beyond sampling.
+#[derive(Clone, Debug)]
+pub struct Options {
+    /// How to sample.
+    pub sample: SampleConfig,
+    /// One result per seed.
+    pub seeds: Vec<u64>,
+    /// Gradient steps on the input views after sampling; 0 for none.
+    pub refine: usize,
+    /// Which way is up in the user's frame.
+    pub up: Up,
+}
+
+/// One sample.
+#[derive(Clone, Debug)]
+pub struct Sample {
+    /// The seed it was drawn with.
+    pub seed: u64,
+    /// As sampled, in the canonical frame.
+    pub plain: Cloud,
+    /// After refinement, in the canonical frame; the same as `plain` without it.
+    pub refined: Cloud,
+}
+
+/// A reconstruction and what it took.
+#[derive(Clone, Debug)]
+pub struct Reconstruction {
+    /// One per seed.
+    pub samples: Vec<Sample>,
+    /// Where the object was found.
+    pub frame: Frame,
+    /// Seconds per stage, in order.
+    pub seconds: Vec<(&'static str, f64)>,
+}
+
+/// Samples Gaussians for `views`, and refines them if asked to.
+pub fn run(
+    views: &[View],
+    checkpoint: &Checkpoint,
+    options: &Options,
+    device: &Device,
+) -> Result<Reconstruction, CliError> {
+    let mut seconds = Vec::new();
+    let begin = Instant::now();
+    let frame = canonical_frame(views, options.up)?;
+    let canonical: Vec<View> = views
+        .iter()
+        .map(|v| View { camera: v.camera.transformed(&frame.canonical_from_user), ..v.clone() })
+        .collect();
+    seconds.push(("frame", begin.elapsed().as_secs_f64()));
+
+    let begin = Instant::now();
+    let mut bar = Progress::new("sampling", options.sample.steps as u64);
+    let clouds = reconstruct(checkpoint, &canonical, &options.sample, &options.seeds, device, |step| {
+        bar.at(step.index as u64, "");
+    })?;
+    bar.finish();
+    seconds.push(("sample", begin.elapsed().as_secs_f64()));
+
+    let begin = Instant::now();
+    let mut samples = Vec::with_capacity(clouds.len());
+    for (&seed, plain) in options.seeds.iter().zip(clouds) {
+        let refined = match options.refine {
+            0 => plain.clone(),
+            steps => {
+                let mut bar = Progress::new("refining", steps as u64);
+                let config = RefineConfig { steps, seed, ..RefineConfig::default() };
+                let refined = refine(&plain, &canonical, &config, |p| bar.at(p.step as u64, &format!("loss {:.4}", p.loss)))?;
+                bar.finish();
+                refined
+            }
+        };
+        samples.push(Sample { seed, plain, refined });
+    }
+    if options.refine > 0 {
+        seconds.push(("refine", begin.elapsed().as_secs_f64()));
+    }
+    Ok(Reconstruction { samples, frame, seconds })
+}
+
+/// Takes a cloud from the canonical frame to the user's.
+pub fn to_user(cloud: &Cloud, canonical_from_user: &Similarity) -> Cloud {
+    let back = canonical_from_user.inverse();
+    let mut cloud = cloud.clone();
+    cloud.transform(back.scale, back.rotation, back.translation);
+    cloud
+}
+
+/// Agreement of renders with the images of one view, on white at the image's own resolution.
+#[derive(Clone, Debug, Serialize)]
+pub struct ViewScore {
+    /// The view.
+    pub name: String,
+    /// Peak signal-to-noise ratio, dB.
+    pub psnr: f64,
+    /// Structural similarity as the 3DGS papers compute it (11 x 11 Gaussian window, zero padding).
+    pub ssim: f64,
+}
+
+/// Scores of a set of views.
+#[derive(Clone, Debug, Serialize)]
+pub struct Scores {
+    /// Mean over the views, dB.
+    pub psnr: f64,
+    /// Mean over the views.
+    pub ssim: f64,
+    /// Every view.
+    pub views: Vec<ViewScore>,
+}
+
+/// Compares renders of `cloud` with `views`; both in one frame. Returns none for no views.
+pub fn score(cloud: &Cloud, views: &[View]) -> Result<Option<Scores>, CliError> {
+    let scored = views
+        .iter()
+        .map(|view| {
+            let (w, h) = view.image.dimensions();
+            // As a viewer would see it: clamped to the range of a picture.
+            let render: Vec<f32> = render_view(cloud, &view.camera)?.iter().map(|x| x.clamp(0.0, 1.0)).collect();
+            let truth = composite(&view.image, WHITE);
+            Ok(ViewScore {
+                name: view.name.clone(),
+                psnr: psnr(&render, &truth)?,
+                ssim: ssim_3dgs(&render, &truth, w as usize, h as usize)?,
+            })
+        })
+        .collect::<Result<Vec<_>, CliError>>()?;
+    if scored.is_empty() {
+        return Ok(None);
+    }
+    let mean = |f: fn(&ViewScore) -> f64| scored.iter().map(f).sum::<f64>() / scored.len() as f64;
+    Ok(Some(Scores { psnr: mean(|v| v.psnr), ssim: mean(|v| v.ssim), views: scored }))
+}

@@ -1,0 +1,53 @@
+//! Progress on standard error: a bar on a terminal, a line now and then in a log.
+
+use std::{
+    io::IsTerminal,
+    time::{Duration, Instant},
+};
+
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+
+/// Time between two lines in a log.
+const LINE_EVERY: Duration = Duration::from_secs(5);
+
+/// The progress of one task.
+pub struct Progress {
+    bar: ProgressBar,
+    label: String,
+    total: u64,
+    begin: Instant,
+    last_line: Option<Instant>,
+}
+
+impl Progress {
+    /// A task of `total` steps.
+    pub fn new(label: &str, total: u64) -> Self {
+        let target = match std::io::stderr().is_terminal() {
+            true => ProgressDrawTarget::stderr(),
+            false => ProgressDrawTarget::hidden(),
+        };
+        let style = ProgressStyle::with_template("{prefix:>12} {bar:32} {pos}/{len} {eta} {msg}").expect("a valid template");
+        let bar = ProgressBar::with_draw_target(Some(total), target).with_style(style).with_prefix(label.to_owned());
+        Self { bar, label: label.into(), total, begin: Instant::now(), last_line: None }
+    }
+
+    /// `done` steps are done; `message` says more.
+    pub fn at(&mut self, done: u64, message: &str) {
+        self.bar.set_position(done);
+        self.bar.set_message(message.to_owned());
+        if self.bar.is_hidden() && self.last_line.is_none_or(|t| t.elapsed() >= LINE_EVERY) {
+            // The first line waits too: quick tasks need none.
+            if self.last_line.is_some() || self.begin.elapsed() >= LINE_EVERY {
+                eprintln!("{}: {done}/{} {message}", self.label, self.total);
+                self.last_line = Some(Instant::now());
+            } else if self.begin.elapsed() < LINE_EVERY {
+                return;
+            }
+        }
+    }
+
+    /// The task is over: the bar goes away.
+    pub fn finish(self) {
+        self.bar.finish_and_clear();
+    }
+}

@@ -1,0 +1,175 @@
+//! The canonical frame: where the model expects an object to be (METHOD.md, section 2).
+//!
+//! The object lies in a sphere of radius 0.5 about the origin, +z is up, and cameras stand some 1.5 to 2 away. The
+//! similarity found here takes a user's scene there; its inverse takes the result back to the user's own frame.
+
+mod silhouette;
+mod similarity;
+
+pub use similarity::Similarity;
+
+use crate::{CameraError, View};
+use glam::{DMat3, DQuat, DVec3};
+use silhouette::{Hull, Silhouette};
+
+/// Radius of the sphere that holds a canonical object.
+pub const CANONICAL_RADIUS: f64 = 0.5;
+/// Mean camera distance where nothing shows the object's size: the middle of the training data's.
+const CANONICAL_DISTANCE: f64 = 1.75;
+
+/// Which direction of the user's frame is up.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Up {
+    /// +z, as in NeRF's data sets, Blender and nerfstudio.
+    #[default]
+    Z,
+    /// +y, as in glTF and OpenGL scenes.
+    Y,
+    /// The mean of the cameras' own up directions.
+    Cameras,
+}
+
+/// How the canonical frame is found.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(default)]
+pub struct FrameConfig {
+    /// Which direction is up.
+    pub up: Up,
+    /// Leave place and scale as they are where the scene already looks canonical.
+    pub keep_canonical: bool,
+}
+
+impl Default for FrameConfig {
+    fn default() -> Self {
+        Self { up: Up::Z, keep_canonical: true }
+    }
+}
+
+/// The transform to the canonical frame, and what it rests on.
+#[derive(Clone, Debug)]
+pub struct CanonicalFrame {
+    /// From the user's frame to the canonical one.
+    pub canonical_from_user: Similarity,
+    /// What was found, for the user to read.
+    pub notes: Vec<String>,
+}
+
+/// Finds the transform that takes the object seen in `views` to the canonical frame.
+///
+/// The object's place is first the point nearest to the cameras' lines of sight (through the masks' centroids where
+/// there is alpha, else the optical axes). Where two or more views have a mask, the visual hull then gives the box
+/// whose middle becomes the origin, and hull and outlines together the radius; otherwise the mean camera distance
+/// sets the scale. A scene that already is canonical keeps its frame exactly.
+pub fn canonical_from_user(views: &[View], config: &FrameConfig) -> Result<CanonicalFrame, CameraError> {
+    if views.len() < 2 {
+        return Err(CameraError::Frame(format!("expected at least 2 views, found {}", views.len())));
+    }
+    let silhouettes: Vec<Silhouette> = views.iter().filter_map(Silhouette::of).collect();
+    let rotation = upright(views, config.up)?;
+    let mut notes = Vec::new();
+    let cropped = silhouettes.iter().filter(|s| s.cropped).count();
+    if cropped > 0 {
+        notes.push(format!("the object reaches the image border in {cropped} of {} views", views.len()));
+    }
+    if config.keep_canonical && is_canonical(views, &silhouettes) {
+        notes.push("the scene already is in the canonical frame: place and scale are kept".into());
+        let canonical_from_user = Similarity { rotation, ..Similarity::IDENTITY };
+        return Ok(CanonicalFrame { canonical_from_user, notes });
+    }
+
+    let axes: Vec<(DVec3, DVec3)> = views.iter().map(optical_axis).collect();
+    let (centre, radius) = if silhouettes.len() >= 2 {
+        let lines: Vec<(DVec3, DVec3)> = silhouettes.iter().map(|s| (s.origin, s.towards)).collect();
+        from_silhouettes(&silhouettes, nearest_point(&lines)?)?
+    } else {
+        let centre = nearest_point(&axes)?;
+        let mean = axes.iter().map(|(o, _)| o.distance(centre)).sum::<f64>() / axes.len() as f64;
+        notes.push("no masks: the object's size is taken from the cameras' distance".into());
+        (centre, mean * CANONICAL_RADIUS / CANONICAL_DISTANCE)
+    };
+    let scale = CANONICAL_RADIUS / radius;
+    let translation = -scale * (rotation * centre);
+    // Written so that NaN fails.
+    if !(scale > 0.0 && scale.is_finite() && translation.is_finite()) {
+        return Err(CameraError::Frame(format!("an object of radius {radius} at {centre}")));
+    }
+    let rounded = |v: f64| (v * 1e4).round() / 1e4;
+    let (x, y, z) = (rounded(centre.x), rounded(centre.y), rounded(centre.z));
+    notes.push(format!("the object was found at ({x}, {y}, {z}) with radius {}", rounded(radius)));
+    Ok(CanonicalFrame { canonical_from_user: Similarity { scale, rotation, translation }, notes })
+}
+
+fn optical_axis(view: &View) -> (DVec3, DVec3) {
+    (view.camera.center(), DMat3::from_mat4(view.camera.world_to_camera).transpose().z_axis)
+}
+
+/// The rotation that turns the user's up to +z.
+fn upright(views: &[View], up: Up) -> Result<DQuat, CameraError> {
+    let up = match up {
+        Up::Z => return Ok(DQuat::IDENTITY),
+        Up::Y => DVec3::Y,
+        Up::Cameras => {
+            let own = |view: &View| -DMat3::from_mat4(view.camera.world_to_camera).transpose().y_axis;
+            let mean = views.iter().map(own).sum::<DVec3>() / views.len() as f64;
+            if mean.length() < 0.1 {
+                return Err(CameraError::Frame("the cameras' up directions cancel; say which axis is up".into()));
+            }
+            mean.normalize()
+        }
+    };
+    Ok(DQuat::from_rotation_arc(up, DVec3::Z))
+}
+
+/// Cameras that all look at the origin from the training data's distances, and an object that fills the sphere.
+fn is_canonical(views: &[View], silhouettes: &[Silhouette]) -> bool {
+    let aimed = views.iter().map(optical_axis).all(|(origin, axis)| {
+        let miss = origin.cross(axis).length();
+        miss < 0.02 && origin.dot(axis) < 0.0 && (1.2..=2.3).contains(&origin.length())
+    });
+    let radius = silhouettes.iter().map(|s| s.radius(DVec3::ZERO)).fold(0.0, f64::max);
+    aimed && (silhouettes.is_empty() || (0.35..=0.55).contains(&radius))
+}
+
+/// The point with the least sum of squared distances to lines `(origin, unit direction)`.
+fn nearest_point(lines: &[(DVec3, DVec3)]) -> Result<DVec3, CameraError> {
+    let across = |d: DVec3| DMat3::IDENTITY - DMat3::from_cols(d * d.x, d * d.y, d * d.z);
+    let mut normal = DMat3::ZERO;
+    let mut right = DVec3::ZERO;
+    let middle = lines.iter().map(|(o, _)| *o).sum::<DVec3>() / lines.len() as f64;
+    for (o, d) in lines {
+        normal += across(*d);
+        right += across(*d) * (*o - middle);
+    }
+    // The determinant falls with the squared angle between the lines; 1e-4 is about one degree.
+    let count = lines.len() as f64;
+    if !(normal.determinant() / count.powi(3) > 1e-4) {
+        return Err(CameraError::Frame(
+            "all cameras look in the same direction; expected views from different sides".into(),
+        ));
+    }
+    let point = middle + normal.inverse() * right;
+    if lines.iter().any(|(o, d)| (point - *o).dot(*d) <= 0.0) {
+        return Err(CameraError::Frame(
+            "the cameras do not look at one common point; are the poses camera-to-world with OpenGL axes?".into(),
+        ));
+    }
+    Ok(point)
+}
+
+/// Centre and radius of the object from two or more masks.
+fn from_silhouettes(silhouettes: &[Silhouette], start: DVec3) -> Result<(DVec3, f64), CameraError> {
+    let seen = |centre: DVec3| silhouettes.iter().map(|s| s.radius(centre)).fold(0.0, f64::max);
+    let hull = Hull::carve(silhouettes, start, 2.0 * seen(start)).ok_or_else(|| {
+        CameraError::Frame("no point of space lies inside all masks: poses and images contradict each other".into())
+    })?;
+    // Seen from one side only, the hull is a long wedge and its middle says little; the lines of sight do better. The
+    // mean line of sight is short where cameras stand all around, and near 1 where they stand together. The bounds
+    // are measured: on 21 scanned objects the hull is twice as good at 0.17, the lines four times at 0.91.
+    let one_sided = silhouettes.iter().map(|s| s.towards).sum::<DVec3>().length() / silhouettes.len() as f64;
+    let t = ((one_sided - 0.4) / 0.45).clamp(0.0, 1.0);
+    let centre = hull.box_centre.lerp(start, t * t * (3.0 - 2.0 * t));
+    // The outlines bound the radius from below and come close to it; the hull bounds it from above, and guards
+    // against specks that one mask has and the others do not.
+    Ok((centre, seen(centre).min(hull.radius(centre))))
+}

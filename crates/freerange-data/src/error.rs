@@ -1,0 +1,60 @@
+use std::path::PathBuf;
+
+/// What can go wrong with training data.
+#[derive(Debug, thiserror::Error)]
+pub enum DataError {
+    /// An object has no slice of its tree at the asked depth.
+    #[error("object {object}: no Gaussians at depth {expected}; it has depths {found:?}")]
+    Depth {
+        /// The object.
+        object: String,
+        /// The depth asked for.
+        expected: u32,
+        /// The depths there are.
+        found: Vec<u32>,
+    },
+    /// A configuration field has an impossible value.
+    #[error("{field}: expected {expected}, found {found}")]
+    Config {
+        /// The field.
+        field: String,
+        /// What it may be.
+        expected: String,
+        /// What it is.
+        found: String,
+    },
+    /// A file or folder is not what it should be.
+    #[error("{}: {problem}", path.display())]
+    File {
+        /// The file or folder.
+        path: PathBuf,
+        /// What is wrong.
+        problem: String,
+    },
+    /// Reading or writing failed.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// The reason.
+        source: std::io::Error,
+    },
+    /// A thread that makes objects ended early.
+    #[error("the thread that makes object {index} has died")]
+    Worker {
+        /// Number of the object.
+        index: u64,
+    },
+    /// The Gaussians or their tree.
+    #[error(transparent)]
+    Splat(#[from] freerange_splat::SplatError),
+    /// The mesh or its renderer.
+    #[error(transparent)]
+    Mesh(#[from] freerange_mesh::MeshError),
+    /// The rasteriser.
+    #[error(transparent)]
+    Raster(#[from] freerange_raster::RasterError),
+    /// The fit.
+    #[error(transparent)]
+    Fit(#[from] freerange_fit::FitError),
+}

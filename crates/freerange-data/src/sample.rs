@@ -1,0 +1,275 @@
+//! One object as the entries of a shard, and back.
+//!
+//! | entry | content |
+//! |---|---|
+//! | `KEY.json` | [`Metadata`] |
+//! | `KEY.cameras.json` | name, size, intrinsics and pose of every view; see [`CAMERAS`] |
+//! | `KEY.gaussians.safetensors` | `depth_08` f32 `[256, 14]`, ...: the slices, channels as in [`freerange_splat::channel`] |
+//! | `KEY.000.png`, ... | the views, 8-bit RGBA with straight alpha, in the order of the cameras |
+
+use std::collections::BTreeMap;
+use std::io::Cursor;
+use std::path::Path;
+
+use freerange_camera::{Camera, View};
+use freerange_splat::{Cloud, channel};
+use glam::{DMat3, DMat4, DVec4};
+use image::{ColorType, DynamicImage, ImageDecoder, ImageFormat, RgbaImage, codecs::png::PngDecoder};
+use safetensors::{Dtype, SafeTensors, tensor::TensorView};
+
+use crate::{DataError, Object};
+
+/// Ends of the names of an object's entries but its views.
+pub(crate) const METADATA: &str = "json";
+pub(crate) const CAMERAS: &str = "cameras.json";
+pub(crate) const GAUSSIANS: &str = "gaussians.safetensors";
+
+/// Largest number of views of an object.
+pub(crate) const MAX_VIEWS: usize = 1000;
+/// Largest side of a view, in pixels.
+pub(crate) const MAX_SIDE: u32 = 8192;
+/// Pixels that the views of an object may have together: 1 GiB decoded.
+const MAX_PIXELS: u64 = 1 << 28;
+/// Deepest slice.
+pub(crate) const MAX_DEPTH: u32 = 22;
+
+/// What is known of an object besides its views and Gaussians.
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Metadata {
+    /// The object's name: the key of its entries.
+    pub id: String,
+    /// Where it comes from.
+    pub source: String,
+    /// Licence of the object, as an SPDX identifier.
+    pub licence: String,
+    /// Seed it was made from.
+    pub seed: u64,
+    /// SHA-256 of the configuration it was made with.
+    pub config_sha256: String,
+    /// By depth, PSNR in dB of the slice's renders against views that its Gaussians were not fitted to; empty where
+    /// not measured.
+    pub psnr: BTreeMap<u32, f64>,
+}
+
+/// `KEY.cameras.json`. Axes are OpenCV's (x right, y down, z forward), the world is the canonical frame (+z up, object
+/// inside the sphere of radius 0.5), pixel centres lie at +0.5.
+#[derive(serde::Serialize, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Cameras {
+    convention: String,
+    views: Vec<Posed>,
+}
+
+const CONVENTION: &str = "opencv";
+
+#[derive(serde::Serialize, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Posed {
+    name: String,
+    width: u32,
+    height: u32,
+    fx: f64,
+    fy: f64,
+    cx: f64,
+    cy: f64,
+    world_to_camera: [[f64; 4]; 4], // rows
+}
+
+/// Where in a folder of shards something was found.
+#[derive(Clone, Copy)]
+pub(crate) struct Place<'a> {
+    pub shard: &'a Path,
+    pub sample: &'a str,
+    pub entry: &'a str,
+}
+
+impl Place<'_> {
+    pub fn error(&self, expected: impl Into<String>, found: impl ToString) -> DataError {
+        DataError::Sample {
+            shard: self.shard.into(),
+            sample: self.sample.into(),
+            entry: self.entry.into(),
+            expected: expected.into(),
+            found: found.to_string(),
+        }
+    }
+}
+
+/// Name of the entry of view `i`, without the key.
+pub(crate) fn view_entry(i: usize) -> String {
+    format!("{i:03}.png")
+}
+
+fn tensor_name(depth: u32) -> String {
+    format!("depth_{depth:02}")
+}
+
+/// Whether `key` can name an object: up to 64 of `A-Z a-z 0-9 - _`.
+pub(crate) fn is_key(key: &str) -> bool {
+    (1..=64).contains(&key.len()) && key.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'-' || b == b'_')
+}
+
+/// The entries of an object in the order of a shard: what follows `KEY.` in the name, and the bytes.
+/// `shard` is for messages only. Refuses whatever [`Shards`](crate::Shards) would refuse to read.
+pub(crate) fn encode(object: &Object, metadata: &Metadata, shard: &Path) -> Result<Vec<(String, Vec<u8>)>, DataError> {
+    let place = |entry| Place { shard, sample: &object.id, entry };
+    if !is_key(&object.id) || metadata.id != object.id {
+        return Err(place(METADATA).error("an id of 1 to 64 characters A-Z a-z 0-9 - _", format!("{:?}", metadata.id)));
+    }
+    let json = |entry, value: serde_json::Result<Vec<u8>>| value.map_err(|e| place(entry).error("values JSON can hold", e));
+
+    let cameras: Vec<Camera> = object.views.iter().map(|v| v.camera).collect();
+    check_cameras(&cameras, place(CAMERAS))?;
+    let views = object.views.iter().map(|v| {
+        let Camera { width, height, fx, fy, cx, cy, world_to_camera } = v.camera;
+        let world_to_camera = world_to_camera.transpose().to_cols_array_2d();
+        Posed { name: v.name.clone(), width, height, fx, fy, cx, cy, world_to_camera }
+    });
+    let cameras = Cameras { convention: CONVENTION.into(), views: views.collect() };
+    let mut entries = vec![
+        (METADATA.into(), json(METADATA, serde_json::to_vec_pretty(metadata))?),
+        (CAMERAS.into(), json(CAMERAS, serde_json::to_vec(&cameras))?),
+        (GAUSSIANS.into(), encode_slices(&object.slices, place(GAUSSIANS))?),
+    ];
+    for (i, view) in object.views.iter().enumerate() {
+        let name = view_entry(i);
+        let size = (view.camera.width, view.camera.height);
+        if view.image.dimensions() != size {
+            let (w, h) = view.image.dimensions();
+            return Err(place(&name).error(format!("the camera's {} x {} pixels", size.0, size.1), format!("{w} x {h}")));
+        }
+        let mut png = Cursor::new(Vec::new());
+        view.image.write_to(&mut png, ImageFormat::Png).map_err(|e| place(&name).error("an image PNG can hold", e))?;
+        entries.push((name, png.into_inner()));
+    }
+    Ok(entries)
+}
+
+fn encode_slices(slices: &BTreeMap<u32, Cloud>, place: Place) -> Result<Vec<u8>, DataError> {
+    let mut tensors = Vec::with_capacity(slices.len());
+    for (&depth, cloud) in slices {
+        if depth > MAX_DEPTH || cloud.len() != 1 << depth {
+            let expected = format!("2^depth Gaussians at depths up to {MAX_DEPTH}");
+            return Err(place.error(expected, format!("{} at depth {depth}", cloud.len())));
+        }
+        cloud.check_finite()?;
+        let bytes: Vec<u8> = cloud.rows().iter().flat_map(|v| v.to_le_bytes()).collect();
+        tensors.push((tensor_name(depth), cloud.len(), bytes));
+    }
+    let view = |n: usize, bytes| TensorView::new(Dtype::F32, vec![n, channel::COUNT], bytes);
+    let refused = |e| place.error("tensors safetensors can hold", e);
+    let views = tensors.iter().map(|(name, n, bytes)| Ok((name, view(*n, bytes)?)));
+    let views = views.collect::<Result<Vec<_>, _>>().map_err(refused)?;
+    safetensors::serialize(views, None).map_err(refused)
+}
+
+/// `KEY.json`.
+pub(crate) fn decode_metadata(bytes: &[u8], place: Place) -> Result<Metadata, DataError> {
+    let metadata: Metadata = serde_json::from_slice(bytes).map_err(|e| place.error("the object's metadata", e))?;
+    if metadata.id != place.sample {
+        return Err(place.error(format!("id {:?}", place.sample), format!("{:?}", metadata.id)));
+    }
+    Ok(metadata)
+}
+
+/// `KEY.cameras.json`: names and cameras of `count` views.
+pub(crate) fn decode_cameras(bytes: &[u8], count: usize, place: Place) -> Result<Vec<(String, Camera)>, DataError> {
+    let cameras: Cameras = serde_json::from_slice(bytes).map_err(|e| place.error("the cameras of the views", e))?;
+    if cameras.convention != CONVENTION {
+        return Err(place.error(format!("convention {CONVENTION:?}"), format!("{:?}", cameras.convention)));
+    }
+    if cameras.views.len() != count {
+        return Err(place.error(format!("{count} cameras, one per view"), cameras.views.len()));
+    }
+    let (names, cameras): (Vec<String>, Vec<Camera>) = cameras
+        .views
+        .into_iter()
+        .map(|v| {
+            let Posed { name, width, height, fx, fy, cx, cy, world_to_camera } = v;
+            let world_to_camera = DMat4::from_cols_array_2d(&world_to_camera).transpose();
+            (name, Camera { width, height, fx, fy, cx, cy, world_to_camera })
+        })
+        .unzip();
+    check_cameras(&cameras, place)?;
+    Ok(names.into_iter().zip(cameras).collect())
+}
+
+fn check_cameras(cameras: &[Camera], place: Place) -> Result<(), DataError> {
+    if !(1..=MAX_VIEWS).contains(&cameras.len()) {
+        return Err(place.error(format!("1 to {MAX_VIEWS} views"), cameras.len()));
+    }
+    for (i, c) in cameras.iter().enumerate() {
+        let size = format!("{} x {} pixels in view {i}", c.width, c.height);
+        if !(1..=MAX_SIDE).contains(&c.width) || !(1..=MAX_SIDE).contains(&c.height) {
+            return Err(place.error(format!("sides of 1 to {MAX_SIDE} pixels"), size));
+        }
+        if (c.width, c.height) != (cameras[0].width, cameras[0].height) {
+            return Err(place.error("views of one size", size));
+        }
+        let intrinsics = [c.fx, c.fy, c.cx, c.cy];
+        if !intrinsics.iter().all(|v| v.is_finite()) || c.fx <= 0.0 || c.fy <= 0.0 {
+            return Err(place.error("finite intrinsics with positive focal lengths", format!("{intrinsics:?} in view {i}")));
+        }
+        let r = DMat3::from_mat4(c.world_to_camera);
+        let rigid = (r * r.transpose()).abs_diff_eq(DMat3::IDENTITY, 1e-4)
+            && r.determinant() > 0.0
+            && c.world_to_camera.row(3) == DVec4::W
+            && c.world_to_camera.w_axis.is_finite();
+        if !rigid {
+            return Err(place.error("a rotation and a translation", format!("{} in view {i}", c.world_to_camera)));
+        }
+    }
+    let pixels = cameras.iter().map(|c| u64::from(c.width) * u64::from(c.height)).sum::<u64>();
+    if pixels > MAX_PIXELS {
+        return Err(place.error(format!("at most {MAX_PIXELS} pixels in all views"), pixels));
+    }
+    Ok(())
+}
+
+/// `KEY.000.png` of `camera`'s size.
+pub(crate) fn decode_view(bytes: &[u8], name: String, camera: Camera, place: Place) -> Result<View, DataError> {
+    let broken = |e| place.error("a PNG file", e);
+    let decoder = PngDecoder::new(Cursor::new(bytes)).map_err(broken)?;
+    // Before decoding: a few bytes of PNG can claim gigabytes of pixels.
+    if decoder.dimensions() != (camera.width, camera.height) || decoder.color_type() != ColorType::Rgba8 {
+        let expected = format!("{} x {} pixels of Rgba8", camera.width, camera.height);
+        let (w, h) = decoder.dimensions();
+        return Err(place.error(expected, format!("{w} x {h} of {:?}", decoder.color_type())));
+    }
+    let image: RgbaImage = DynamicImage::from_decoder(decoder).map_err(broken)?.into_rgba8();
+    Ok(View { name, camera, image })
+}
+
+/// Of `KEY.gaussians.safetensors` the slices at `depths`.
+pub(crate) fn decode_slices(bytes: &[u8], depths: &[u32], place: Place) -> Result<BTreeMap<u32, Cloud>, DataError> {
+    let tensors = SafeTensors::deserialize(bytes).map_err(|e| place.error("a safetensors file", e))?;
+    depths
+        .iter()
+        .map(|&depth| {
+            let name = tensor_name(depth);
+            let tensor = tensors.tensor(&name).map_err(|_| DataError::Depth {
+                object: place.sample.into(),
+                expected: depth,
+                found: depths_in(&tensors),
+            })?;
+            let shape = [1usize << depth.min(MAX_DEPTH), channel::COUNT];
+            if tensor.dtype() != Dtype::F32 || tensor.shape() != shape {
+                let found = format!("{:?} {:?}", tensor.dtype(), tensor.shape());
+                return Err(place.error(format!("tensor {name} of F32 {shape:?}"), found));
+            }
+            let values = tensor.data().as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b));
+            let cloud = Cloud::from_rows(values.collect());
+            cloud.check_finite().map_err(|e| place.error(format!("finite numbers in tensor {name}"), e))?;
+            Ok((depth, cloud))
+        })
+        .collect()
+}
+
+fn depths_in(tensors: &SafeTensors) -> Vec<u32> {
+    let names = tensors.names();
+    let mut depths: Vec<u32> =
+        names.into_iter().filter_map(|n| n.strip_prefix("depth_")?.parse().ok()).take(64).collect();
+    depths.sort_unstable();
+    depths
+}

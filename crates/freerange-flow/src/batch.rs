@@ -1,0 +1,184 @@
+//! From objects to tensors: what the network sees, what it should say, and what renders are compared with.
+
+use std::sync::Arc;
+
+use burn::tensor::{Device, Tensor, TensorData};
+use freerange_camera::{PatchLayout, View, plucker, resize_area, to_f32_rgba};
+use freerange_data::Object;
+use freerange_model::{FreeRange, ModelConfig};
+use freerange_splat::{Normalization, channel};
+use rand::{Rng, SeedableRng, seq::SliceRandom};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+
+use crate::{
+    FlowError,
+    config::{LossConfig, Stage},
+    photometric::Targets,
+};
+
+/// The same view at most `size` pixels wide and high, aspect kept.
+pub fn shrink(view: &View, size: u32) -> View {
+    let (w, h) = view.image.dimensions();
+    let longest = w.max(h);
+    if longest <= size {
+        return view.clone();
+    }
+    let scaled = |x: u32| ((f64::from(x) * f64::from(size) / f64::from(longest)).round() as u32).max(1);
+    resized(view, scaled(w), scaled(h))
+}
+
+fn resized(view: &View, w: u32, h: u32) -> View {
+    if view.image.dimensions() == (w, h) {
+        return view.clone();
+    }
+    View { name: view.name.clone(), camera: view.camera.resized(w, h), image: resize_area(&view.image, w, h) }
+}
+
+/// A colour for what lies behind the object.
+pub fn draw_background(rng: &mut ChaCha8Rng) -> [f32; 3] {
+    std::array::from_fn(|_| rng.random())
+}
+
+/// The posed images as the image encoder takes them.
+#[derive(Clone, Debug)]
+pub struct Conditioning {
+    /// `[b, views, h, w, channels]`: colour composited on white, then alpha where the encoder has four channels.
+    pub images: Tensor<5>,
+    /// `[b, views, rows, columns, 6]`, one ray per patch centre.
+    pub plucker: Tensor<5>,
+}
+
+impl Conditioning {
+    /// From the input views of each object; all objects have the same number of views. Images are resized to the
+    /// encoder's square side, intrinsics with them.
+    pub fn new(objects: &[Vec<&View>], config: &ModelConfig, device: &Device) -> Result<Self, FlowError> {
+        let (b, v) = (objects.len(), objects.first().map_or(0, Vec::len));
+        if v == 0 {
+            return Err(FlowError::NoViews);
+        }
+        let size = config.image_size;
+        let (channels, grid) = (config.image_channels(), config.patches_per_side());
+        let (mut pixels, mut rays) = (Vec::new(), Vec::new());
+        for view in objects.iter().flatten() {
+            let view = resized(view, size, size);
+            pixels.extend(to_f32_rgba(&view.image).chunks_exact(4).flat_map(|p| {
+                let on_white = |c: f32| c * p[3] + 1.0 - p[3];
+                [on_white(p[0]), on_white(p[1]), on_white(p[2]), p[3]].into_iter().take(channels)
+            }));
+            rays.extend(plucker(&view.camera, grid, grid, PatchLayout::Scaled));
+        }
+        let size = size as usize;
+        Ok(Self {
+            images: Tensor::from_data(TensorData::new(pixels, [b, v, size, size, channels]), device),
+            plucker: Tensor::from_data(TensorData::new(rays, [b, v, grid, grid, 6]), device),
+        })
+    }
+
+    /// The image tokens. `[b, views * rows * columns, features]`
+    pub fn encode(self, model: &FreeRange) -> Tensor<3> {
+        model.encode(self.images, self.plucker)
+    }
+}
+
+/// Everything one training step needs.
+#[derive(Clone, Debug)]
+pub struct Batch {
+    /// Clean, normalised Gaussians z_1. `[b, n, 14]`
+    pub data: Tensor<3>,
+    /// Noise, paired with them. `[b, n, 14]`
+    pub noise: Tensor<3>,
+    /// Time of each sample.
+    pub t: Vec<f32>,
+    /// 1 where the sample sees its images, 0 where it is trained unconditionally. `[b, 1, 1]`
+    pub conditional: Tensor<3>,
+    /// The input views as the encoder takes them.
+    pub conditioning: Conditioning,
+    /// The input views at the size of the gradient channels.
+    pub hint: Targets,
+    /// The input views at the size of the rendering loss.
+    pub seen: Targets,
+    /// Held-out views at the size of the rendering loss; none if the configuration asks for none.
+    pub held: Option<Targets>,
+}
+
+impl Batch {
+    /// Draws times, noise, views and backgrounds for `objects`, all from `rng`.
+    pub fn draw(
+        objects: &[Arc<Object>],
+        stage: &Stage,
+        model: &ModelConfig,
+        loss: &LossConfig,
+        normalization: &Normalization,
+        rng: &mut ChaCha8Rng,
+        device: &Device,
+    ) -> Result<Self, FlowError> {
+        let (b, n) = (objects.len(), 1usize << stage.depth);
+        let inputs = rng.random_range(loss.input_views.0..=loss.input_views.1);
+        let one_sided = rng.random::<f32>() < loss.one_sided;
+
+        let mut data = Vec::with_capacity(b * n * channel::COUNT);
+        let mut noise = Vec::with_capacity(b * n * channel::COUNT);
+        let (mut t, mut conditional, mut backgrounds) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut seen, mut held) = (Vec::new(), Vec::new());
+        for object in objects {
+            let clean = normalization.normalize(object.slice(stage.depth)?);
+            let mut start: Vec<f32> = (0..clean.len()).map(|_| StandardNormal.sample(rng)).collect();
+            loss.coupling.pair(&mut start, &clean);
+            data.extend(clean);
+            noise.extend(start);
+            t.push(loss.time.time(rng.random()));
+            conditional.push(if rng.random::<f32>() < loss.unconditional { 0.0 } else { 1.0 });
+            backgrounds.push(draw_background(rng));
+            let (chosen, rest) = choose_views(&object.views, inputs, one_sided, rng);
+            seen.push(chosen);
+            held.push(rest.into_iter().take(loss.held_views).collect::<Vec<_>>());
+        }
+
+        let at = |views: &[Vec<&View>], size: u32| {
+            let small: Vec<Vec<View>> = views.iter().map(|o| o.iter().map(|v| shrink(v, size)).collect()).collect();
+            let small: Vec<Vec<&View>> = small.iter().map(|o| o.iter().collect()).collect();
+            Targets::new(&small, &backgrounds, device)
+        };
+        let shape = [b, n, channel::COUNT];
+        Ok(Self {
+            data: Tensor::from_data(TensorData::new(data, shape), device),
+            noise: Tensor::from_data(TensorData::new(noise, shape), device),
+            t,
+            conditional: Tensor::from_data(TensorData::new(conditional, [b, 1, 1]), device),
+            conditioning: Conditioning::new(&seen, model, device)?,
+            hint: at(&seen, loss.gradient_size)?,
+            seen: at(&seen, loss.render_size)?,
+            held: if loss.held_views > 0 { Some(at(&held, loss.render_size)?) } else { None },
+        })
+    }
+}
+
+/// Splits views into `count` inputs and the rest, both in random order. One-sided: the inputs are those nearest in
+/// direction to a randomly chosen one.
+fn choose_views<'a>(
+    views: &'a [View],
+    count: usize,
+    one_sided: bool,
+    rng: &mut ChaCha8Rng,
+) -> (Vec<&'a View>, Vec<&'a View>) {
+    let mut order: Vec<&View> = views.iter().collect();
+    order.shuffle(rng);
+    if one_sided && let Some(first) = order.first() {
+        let direction = first.camera.center().normalize();
+        order.sort_by(|a, b| {
+            let cosine = |v: &View| v.camera.center().normalize().dot(direction);
+            cosine(b).total_cmp(&cosine(a))
+        });
+        order[count.min(views.len())..].shuffle(rng);
+    }
+    let rest = order.split_off(count.min(order.len()));
+    (order, rest)
+}
+
+/// The generator of step `step` of a run: independent of how the run got there, so that a resumed run draws the same.
+pub fn step_rng(seed: u64, step: u64) -> ChaCha8Rng {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    rng.set_stream(step.wrapping_add(1));
+    rng
+}

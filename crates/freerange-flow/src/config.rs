@@ -1,0 +1,251 @@
+//! Everything that training needs to know, as one TOML file. `configs/tiny.toml` is a commented example.
+
+use std::path::{Path, PathBuf};
+
+use freerange_data::ObjectConfig;
+use freerange_model::ModelConfig;
+
+use crate::{FlowError, coupling::Coupling, path::TimeSchedule, sample::SampleConfig};
+
+/// A whole training run.
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrainConfig {
+    /// Seed of everything random: initial weights, objects, noise, times, views.
+    #[serde(default)]
+    pub seed: u64,
+    /// The network.
+    pub model: ModelConfig,
+    /// The objects to train on.
+    pub data: DataConfig,
+    /// The loss and its terms; each can be switched off (the paper's ablations).
+    #[serde(default)]
+    pub loss: LossConfig,
+    /// The optimiser.
+    #[serde(default)]
+    pub optimizer: OptimizerConfig,
+    /// The curriculum, coarse to fine.
+    #[serde(rename = "stage")]
+    pub stages: Vec<Stage>,
+    /// How the finished model samples, unless the user says otherwise; kept in the checkpoint.
+    #[serde(default)]
+    pub sample: SampleConfig,
+}
+
+/// Where training objects come from, and how they are used.
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct DataConfig {
+    /// Folder of shards made by `freerange data generate`. Without it, objects are made on the fly, without end.
+    pub shards: Option<PathBuf>,
+    /// How an object is made: its Gaussians, views and cameras.
+    pub object: ObjectConfig,
+    /// Objects held in memory, from which each batch is drawn.
+    pub window: usize,
+    /// Objects that leave the window, and new ones that enter it, with every step.
+    pub fresh: usize,
+    /// Threads that make or read objects beside training.
+    pub workers: usize,
+    /// Objects over which the normalisation statistics are measured before training.
+    pub statistics_objects: usize,
+}
+
+impl Default for DataConfig {
+    fn default() -> Self {
+        Self { shards: None, object: ObjectConfig::default(), window: 64, fresh: 2, workers: 1, statistics_objects: 256 }
+    }
+}
+
+/// The training loss (paper, Section 3.3).
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct LossConfig {
+    /// The flow-matching term.
+    pub flow: bool,
+    /// The rendering loss over input views, `w(t) R_Seen`.
+    pub seen: bool,
+    /// The rendering loss over other views, `w(t) R_Held`.
+    pub held: bool,
+    /// Held-out views per object.
+    pub held_views: usize,
+    /// Side, in pixels, of the images that the rendering losses compare.
+    pub render_size: u32,
+    /// Side, in pixels, of the images that the network's gradient channels are taken on.
+    pub gradient_size: u32,
+    /// Lower bound of `1 - t` in the flow loss.
+    pub min_remaining: f32,
+    /// Probability that a sample is trained without images, for classifier-free guidance.
+    pub unconditional: f32,
+    /// How times are drawn.
+    pub time: TimeSchedule,
+    /// How noise is paired with Gaussians.
+    pub coupling: Coupling,
+    /// Fewest and most input views; the number is drawn for each batch.
+    pub input_views: (usize, usize),
+    /// Share of the batches whose input views all lie on one side of the object.
+    pub one_sided: f32,
+}
+
+impl Default for LossConfig {
+    fn default() -> Self {
+        Self {
+            flow: true,
+            seen: true,
+            held: true,
+            held_views: 4,
+            render_size: 512,
+            gradient_size: 512,
+            min_remaining: crate::path::MIN_REMAINING,
+            unconditional: 0.1,
+            time: TimeSchedule::Cosine,
+            coupling: Coupling::Independent,
+            input_views: (4, 4),
+            one_sided: 0.0,
+        }
+    }
+}
+
+/// AdamW and its schedule.
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct OptimizerConfig {
+    /// Highest learning rate, reached after the warm-up.
+    pub learning_rate: f64,
+    /// Learning rate at the end of the cosine.
+    pub final_learning_rate: f64,
+    /// Steps of linear warm-up.
+    pub warmup: u64,
+    /// Decoupled weight decay.
+    pub weight_decay: f32,
+    /// First and second moment decay.
+    pub betas: (f32, f32),
+    /// Largest joint norm of the gradients.
+    pub clip: f32,
+    /// Decay of the moving average of the weights (reached gradually over the first steps).
+    pub ema: f32,
+}
+
+impl Default for OptimizerConfig {
+    fn default() -> Self {
+        Self {
+            learning_rate: 1e-4,
+            final_learning_rate: 5e-6,
+            warmup: 2000,
+            weight_decay: 0.01,
+            betas: (0.9, 0.95),
+            clip: 1.0,
+            ema: 0.9999,
+        }
+    }
+}
+
+impl OptimizerConfig {
+    /// The learning rate of step `step` of `total`: linear warm-up, then half a cosine.
+    pub fn rate(&self, step: u64, total: u64) -> f64 {
+        if step < self.warmup {
+            return self.learning_rate * (step + 1) as f64 / self.warmup as f64;
+        }
+        let progress = (step - self.warmup) as f64 / (total.saturating_sub(self.warmup)).max(1) as f64;
+        let cosine = 0.5 * (1.0 + (std::f64::consts::PI * progress.min(1.0)).cos());
+        self.final_learning_rate + (self.learning_rate - self.final_learning_rate) * cosine
+    }
+}
+
+/// One stage of the curriculum: a depth of the tree, an image size, a number of steps.
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Stage {
+    /// Depth of the level-of-detail tree: 2^depth Gaussians.
+    pub depth: u32,
+    /// Side, in pixels, of the images that the network sees.
+    pub image_size: u32,
+    /// Objects per step.
+    pub batch: usize,
+    /// Steps.
+    pub steps: u64,
+}
+
+impl TrainConfig {
+    /// Reads and checks a configuration file.
+    pub fn load(path: &Path) -> Result<Self, FlowError> {
+        let text = std::fs::read_to_string(path).map_err(|source| FlowError::Io { path: path.into(), source })?;
+        let config: Self = toml::from_str(&text)
+            .map_err(|e| FlowError::State { path: path.into(), problem: e.to_string() })?;
+        config.validate()?;
+        Ok(config)
+    }
+
+    /// All steps of all stages.
+    pub fn total_steps(&self) -> u64 {
+        self.stages.iter().map(|s| s.steps).sum()
+    }
+
+    /// The stage that step `step` belongs to; the last one from the end on.
+    pub fn stage(&self, step: u64) -> &Stage {
+        let mut end = 0;
+        let found = self.stages.iter().find(|s| {
+            end += s.steps;
+            step < end
+        });
+        found.unwrap_or_else(|| self.stages.last().expect("validated: at least one stage"))
+    }
+
+    /// Every depth of the curriculum.
+    pub fn depths(&self) -> Vec<u32> {
+        let mut depths: Vec<u32> = self.stages.iter().map(|s| s.depth).collect();
+        depths.sort_unstable();
+        depths.dedup();
+        depths
+    }
+
+    /// Refuses impossible values.
+    pub fn validate(&self) -> Result<(), FlowError> {
+        let check = |ok: bool, field: &str, expected: &str, found: String| match ok {
+            true => Ok(()),
+            false => Err(FlowError::Config { field: field.into(), expected: expected.into(), found }),
+        };
+        self.model.validate()?;
+        self.sample.validate()?;
+        check(!self.stages.is_empty(), "stage", "at least one [[stage]]", "none".into())?;
+        for s in &self.stages {
+            check((1..=20).contains(&s.depth), "stage.depth", "1 to 20", s.depth.to_string())?;
+            check(s.batch > 0, "stage.batch", "at least 1", s.batch.to_string())?;
+            check(s.steps > 0, "stage.steps", "at least 1", s.steps.to_string())?;
+            check((8..=2048).contains(&s.image_size), "stage.image_size", "8 to 2048", s.image_size.to_string())?;
+        }
+        let l = &self.loss;
+        let (low, high) = l.input_views;
+        let views = self.data.object.views;
+        check(low >= 1 && low <= high, "loss.input_views", "[fewest, most], at least 1", format!("[{low}, {high}]"))?;
+        check(
+            views >= high + l.held_views,
+            "data.object.views",
+            &format!("at least {} (loss.input_views + loss.held_views)", high + l.held_views),
+            views.to_string(),
+        )?;
+        check(l.flow || l.seen || l.held, "loss", "at least one term", "none".into())?;
+        check((0.0..=1.0).contains(&l.unconditional), "loss.unconditional", "0 to 1", l.unconditional.to_string())?;
+        check((0.0..=1.0).contains(&l.one_sided), "loss.one_sided", "0 to 1", l.one_sided.to_string())?;
+        check(
+            (0.0..1.0).contains(&l.min_remaining),
+            "loss.min_remaining",
+            "0 to below 1",
+            l.min_remaining.to_string(),
+        )?;
+        for (field, size) in [("loss.render_size", l.render_size), ("loss.gradient_size", l.gradient_size)] {
+            check((8..=2048).contains(&size), field, "8 to 2048", size.to_string())?;
+        }
+        let o = &self.optimizer;
+        check(o.learning_rate > 0.0, "optimizer.learning_rate", "above 0", o.learning_rate.to_string())?;
+        check((0.0..1.0).contains(&o.ema), "optimizer.ema", "0 to below 1", o.ema.to_string())?;
+        check(o.clip > 0.0, "optimizer.clip", "above 0", o.clip.to_string())?;
+        check(self.data.window > 0, "data.window", "at least 1", self.data.window.to_string())?;
+        check(self.data.workers > 0, "data.workers", "at least 1", self.data.workers.to_string())?;
+        check(self.data.statistics_objects > 0, "data.statistics_objects", "at least 1", "0".into())?;
+        let p = self.model.gaussians_per_token;
+        for s in &self.stages {
+            check((1usize << s.depth) >= p, "stage.depth", "at least one token", s.depth.to_string())?;
+        }
+        Ok(())
+    }
+}

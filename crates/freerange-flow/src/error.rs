@@ -1,0 +1,70 @@
+use std::path::PathBuf;
+
+/// What can go wrong in training and sampling.
+#[derive(Debug, thiserror::Error)]
+pub enum FlowError {
+    /// An object without views was given.
+    #[error("an object without views: at least one posed image is needed")]
+    NoViews,
+    /// Views of one batch differ in size or number.
+    #[error("views of one batch must agree in number and size: expected {}x{} pixels, found {}x{}", expected.0, expected.1, found.0, found.1)]
+    UnevenViews {
+        /// Size of the first view.
+        expected: (u32, u32),
+        /// Size of the view that differs.
+        found: (u32, u32),
+    },
+    /// A gradient was asked for where nothing was differentiated.
+    #[error("no gradient reached the Gaussians")]
+    NoGradient,
+    /// A configuration field has an impossible value.
+    #[error("{field}: expected {expected}, found {found}")]
+    Config {
+        /// The field, as in the file.
+        field: String,
+        /// What it may be.
+        expected: String,
+        /// What it is.
+        found: String,
+    },
+    /// The loss or a gradient stopped being a number.
+    #[error(
+        "step {step}: the {what} is {value}: training stopped; the last good state is in {}, the batch can be made \
+         again from the seed and the step", state.display()
+    )]
+    NotFinite {
+        /// The step that failed.
+        step: u64,
+        /// Which quantity.
+        what: String,
+        /// Its value.
+        value: f32,
+        /// Where the state before the step lies.
+        state: PathBuf,
+    },
+    /// A training state cannot be continued.
+    #[error("{}: {problem}", path.display())]
+    State {
+        /// The file or folder.
+        path: PathBuf,
+        /// What is wrong with it.
+        problem: String,
+    },
+    /// Reading or writing failed.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// The reason.
+        source: std::io::Error,
+    },
+    /// The rasteriser refused its input.
+    #[error(transparent)]
+    Raster(#[from] freerange_raster::RasterError),
+    /// The model or its checkpoint.
+    #[error(transparent)]
+    Model(#[from] freerange_model::ModelError),
+    /// The training data.
+    #[error(transparent)]
+    Data(#[from] freerange_data::DataError),
+}

@@ -1,0 +1,240 @@
+//! Sampling: from noise to Gaussians that fit the posed images (paper, Section 3.5).
+
+use burn::tensor::{Device, Tensor, TensorData};
+use freerange_camera::View;
+use freerange_model::Checkpoint;
+use freerange_splat::{Cloud, channel};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+
+use crate::{
+    FlowError,
+    batch::{Conditioning, draw_background, shrink},
+    coupling::Coupling,
+    photometric::{Photometric, Targets},
+};
+
+/// How to sample.
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SampleConfig {
+    /// Euler steps from noise to data.
+    pub steps: usize,
+    /// Classifier-free guidance scale s: `z_u + s (z_c - z_u)`. 1 switches it off (and halves the work).
+    pub guidance: f32,
+    /// Photometric guidance scale lambda_PG. 0 switches it off.
+    pub photometric: f32,
+    /// Where the gradient that the network sees as input is taken.
+    pub gradient_at: GradientAt,
+    /// Side, in pixels, of the renders that the photometric gradients are taken on.
+    pub gradient_size: u32,
+    /// Colour behind the object in those renders.
+    pub background: Background,
+    /// How the starting noise is grouped into tokens: as in training.
+    pub coupling: Coupling,
+}
+
+impl Default for SampleConfig {
+    fn default() -> Self {
+        Self {
+            steps: 50,
+            guidance: 2.0,
+            photometric: 50.0,
+            gradient_at: GradientAt::Noisy,
+            gradient_size: 512,
+            background: Background::Random,
+            coupling: Coupling::Independent,
+        }
+    }
+}
+
+impl SampleConfig {
+    /// Refuses impossible values.
+    pub fn validate(&self) -> Result<(), FlowError> {
+        let bad = |field: &str, expected: &str, found: String| {
+            Err(FlowError::Config { field: format!("sample.{field}"), expected: expected.into(), found })
+        };
+        if !(1..=10_000).contains(&self.steps) {
+            return bad("steps", "1 to 10000", self.steps.to_string());
+        }
+        if !self.guidance.is_finite() || self.guidance < 0.0 {
+            return bad("guidance", "a finite number, 0 or more", self.guidance.to_string());
+        }
+        if !self.photometric.is_finite() || self.photometric < 0.0 {
+            return bad("photometric", "a finite number, 0 or more", self.photometric.to_string());
+        }
+        if !(8..=4096).contains(&self.gradient_size) {
+            return bad("gradient_size", "8 to 4096 pixels", self.gradient_size.to_string());
+        }
+        Ok(())
+    }
+}
+
+/// Where the photometric gradient that is fed to the network is taken.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum GradientAt {
+    /// At the noisy sample itself, rendered as Gaussians.
+    #[default]
+    Noisy,
+    /// At the network's estimate of the clean sample in the previous step (the noisy sample in the first).
+    Estimate,
+}
+
+/// What lies behind the object where renders are compared with images.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Background {
+    /// A new colour for every object and step: no object can hide against all of them.
+    #[default]
+    Random,
+    /// White, as in the evaluation.
+    White,
+}
+
+impl Background {
+    /// A colour, drawn from `rng` if need be.
+    pub fn draw(self, rng: &mut ChaCha8Rng) -> [f32; 3] {
+        match self {
+            Self::Random => draw_background(rng),
+            Self::White => [1.0; 3],
+        }
+    }
+}
+
+/// The state that [`euler`] hands to its callback before each step.
+#[derive(Clone, Debug)]
+pub struct Step {
+    /// Number of the step, from 0.
+    pub index: usize,
+    /// Time before the step.
+    pub t: f32,
+    /// The sample before the step. `[b, n, 14]`
+    pub z: Tensor<3>,
+}
+
+/// Integrates the flow with `steps` uniform Euler steps: `z <- z + dt v - lambda grad`, `v = (z1_hat - z) / (1 - t)`.
+///
+/// `estimate` gives the guided estimate of the clean sample, `push` the photometric step `lambda grad` taken there
+/// (or nothing). Returns the last estimate, which is what the paper denormalises.
+pub fn euler(
+    noise: Tensor<3>,
+    steps: usize,
+    mut estimate: impl FnMut(&Step) -> Result<Tensor<3>, FlowError>,
+    mut push: impl FnMut(&Step, &Tensor<3>) -> Result<Option<Tensor<3>>, FlowError>,
+) -> Result<Tensor<3>, FlowError> {
+    let dt = 1.0 / steps as f32;
+    let mut z = noise;
+    let mut last = z.clone();
+    for index in 0..steps {
+        let step = Step { index, t: index as f32 / steps as f32, z: z.clone() };
+        last = estimate(&step)?;
+        z = z.clone() + (last.clone() - z).mul_scalar(dt / (1.0 - step.t));
+        if let Some(push) = push(&step, &last)? {
+            z = z - push;
+        }
+    }
+    Ok(last)
+}
+
+/// `uncond + s (cond - uncond)`: classifier-free guidance.
+pub fn classifier_free(conditional: Tensor<3>, unconditional: Tensor<3>, scale: f32) -> Tensor<3> {
+    unconditional.clone() + (conditional - unconditional).mul_scalar(scale)
+}
+
+/// One object to reconstruct: its posed images, in the canonical frame.
+pub type PosedImages<'a> = &'a [View];
+
+/// Draws one sample of Gaussians per seed that fits the posed images. The whole of Section 3.5.
+///
+/// `views` are in the canonical frame (object within radius 0.5 of the origin); so are the results. Samples of several
+/// seeds run as one batch. `progress` is told each step before it is taken.
+pub fn reconstruct(
+    checkpoint: &Checkpoint,
+    views: PosedImages,
+    config: &SampleConfig,
+    seeds: &[u64],
+    device: &Device,
+    mut progress: impl FnMut(&Step),
+) -> Result<Vec<Cloud>, FlowError> {
+    config.validate()?;
+    let model = &checkpoint.model;
+    let (b, n) = (seeds.len(), 1usize << checkpoint.depth);
+    let objects: Vec<Vec<&View>> = vec![views.iter().collect()];
+
+    // The images are encoded once; every sample and step shares the tokens.
+    let tokens = Conditioning::new(&objects, &checkpoint.config, device)?.encode(model); // [1, m, c]
+    let tokens = tokens.repeat_dim(0, b);
+    let both = Tensor::cat(vec![tokens.clone(), tokens.zeros_like()], 0);
+
+    let photometric = Photometric::new(&checkpoint.normalization, device);
+    let rms = Tensor::<1>::from_floats(checkpoint.gradient_rms, device).reshape([1, 1, channel::COUNT]);
+    let small: Vec<View> = views.iter().map(|v| shrink(v, config.gradient_size)).collect();
+    let small: Vec<Vec<&View>> = vec![small.iter().collect(); b];
+    let mut rng = ChaCha8Rng::seed_from_u64(seeds.first().copied().unwrap_or(0));
+    let backgrounds: Vec<[f32; 3]> = (0..config.steps).map(|_| config.background.draw(&mut rng)).collect();
+    let targets = |index: usize| Targets::new(&small, &vec![backgrounds[index]; b], device);
+
+    let mut noise = Vec::with_capacity(b * n * channel::COUNT);
+    for &seed in seeds {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let mut one: Vec<f32> = (0..n * channel::COUNT).map(|_| StandardNormal.sample(&mut rng)).collect();
+        config.coupling.group(&mut one);
+        noise.extend(one);
+    }
+    let noise = Tensor::from_data(TensorData::new(noise, [b, n, channel::COUNT]), device);
+
+    let mut previous: Option<Tensor<3>> = None;
+    let estimate = |step: &Step| {
+        progress(step);
+        let hint = match checkpoint.config.gradient_channels {
+            false => None,
+            true => {
+                let at = match (config.gradient_at, &previous) {
+                    (GradientAt::Estimate, Some(estimate)) => estimate.clone(),
+                    _ => step.z.clone(),
+                };
+                Some(scale_gradient(photometric.gradient(at, &targets(step.index)?)?, &rms))
+            }
+        };
+        let estimate = if config.guidance == 1.0 {
+            let t = Tensor::full([b], step.t, device);
+            model.denoise(step.z.clone(), hint, tokens.clone(), t)
+        } else {
+            // Conditional and unconditional branch in one batch.
+            let z = step.z.clone().repeat_dim(0, 2);
+            let hint = hint.map(|h| Tensor::cat(vec![h.clone(), h.zeros_like()], 0));
+            let t = Tensor::full([2 * b], step.t, device);
+            let out = model.denoise(z, hint, both.clone(), t);
+            classifier_free(out.clone().narrow(0, 0, b), out.narrow(0, b, b), config.guidance)
+        };
+        previous = Some(estimate.clone());
+        Ok(estimate)
+    };
+    let push = |step: &Step, estimate: &Tensor<3>| {
+        if config.photometric == 0.0 {
+            return Ok(None);
+        }
+        let gradient = photometric.gradient(estimate.clone(), &targets(step.index)?)?;
+        Ok(Some(gradient.mul_scalar(config.photometric)))
+    };
+    let estimate = euler(noise, config.steps, estimate, push)?;
+
+    let raw = photometric.denormalize(estimate).into_data().to_vec::<f32>().map_err(|_| FlowError::NoGradient)?;
+    let clouds = raw.chunks_exact(n * channel::COUNT).map(|rows| {
+        let mut cloud = Cloud::from_rows(rows.to_vec());
+        cloud.canonicalize_rotations();
+        cloud
+    });
+    Ok(clouds.collect())
+}
+
+/// Largest magnitude of a gradient channel, in units of its root mean square: a few Gaussians have gradients
+/// hundreds of times larger than the rest, which say no more than "much".
+const GRADIENT_LIMIT: f32 = 5.0;
+
+/// The gradient as the network sees it: every channel at unit root mean square, outliers cut.
+pub fn scale_gradient(gradient: Tensor<3>, rms: &Tensor<3>) -> Tensor<3> {
+    (gradient / rms.clone()).clamp(-GRADIENT_LIMIT, GRADIENT_LIMIT)
+}

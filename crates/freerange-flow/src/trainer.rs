@@ -1,0 +1,391 @@
+//! The training loop: objects in, checkpoints out, resumable at every saved state as if never stopped.
+
+use std::{
+    collections::VecDeque,
+    path::{Path, PathBuf},
+    sync::Arc,
+    time::Instant,
+};
+
+use burn::{
+    module::Module,
+    optim::{AdamWConfig, GradientsParams, ModuleOptimizer},
+    store::ModuleRecord,
+    tensor::{Device, Tensor},
+};
+use freerange_data::{Generated, Object, ObjectSource, Stream};
+use freerange_model::{Checkpoint, FreeRange, ModelConfig};
+use freerange_splat::{Normalization, Statistics, channel};
+use rand::seq::index::sample as sample_indices;
+
+use crate::{
+    FlowError,
+    batch::{Batch, step_rng},
+    config::TrainConfig,
+    photometric::Photometric,
+    train,
+    weights::{Weights, clip_global_norm},
+};
+
+/// Decay of the running mean square of the photometric gradient.
+const GRADIENT_STATISTIC_DECAY: f32 = 0.99;
+
+/// What is reported after a step.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct Report {
+    /// Steps taken so far, this one included.
+    pub step: u64,
+    /// Total loss.
+    pub loss: f32,
+    /// Flow-matching term.
+    pub flow: f32,
+    /// L1 over input views.
+    pub seen: f32,
+    /// L1 over held-out views.
+    pub held: f32,
+    /// Norm of the gradients before clipping.
+    pub gradient_norm: f32,
+    /// Learning rate.
+    pub learning_rate: f64,
+    /// Seconds that the step took.
+    pub seconds: f64,
+    /// Of these, seconds spent waiting for objects and making tensors of them.
+    pub data_seconds: f64,
+}
+
+/// The part of the state that is neither weights nor optimiser.
+#[derive(Clone, Debug, serde::Serialize, serde::Deserialize)]
+struct Progress {
+    step: u64,
+    seconds: f64,
+    gradient_square: [f32; channel::COUNT],
+    normalization: Normalization,
+}
+
+/// A training run in memory.
+pub struct Trainer {
+    config: TrainConfig,
+    device: Device, // the plain one
+    model: FreeRange,
+    average: Weights,
+    optimizer: ModuleOptimizer,
+    progress: Progress,
+    photometric: Photometric,
+    source: Arc<dyn ObjectSource>,
+    stream: Stream,
+    window: VecDeque<Arc<Object>>,
+    folder: PathBuf,
+}
+
+impl Trainer {
+    /// Starts a run in `folder`, or goes on with the one that is there.
+    ///
+    /// `initial`: weights to start a new run from (fine-tuning); ignored by a run that goes on.
+    pub fn open(
+        config: TrainConfig,
+        folder: &Path,
+        initial: Option<&Checkpoint>,
+        device: &Device,
+        mut progress: impl FnMut(&str),
+    ) -> Result<Self, FlowError> {
+        config.validate()?;
+        std::fs::create_dir_all(folder).map_err(|source| FlowError::Io { path: folder.into(), source })?;
+        check_same_run(&config, folder)?;
+        let plain = device.clone().inner();
+        let source: Arc<dyn ObjectSource> = match &config.data.shards {
+            Some(path) => Arc::new(freerange_data::Shards::open(path, &config.depths())?),
+            None => Arc::new(Generated {
+                config: config.data.object.clone(),
+                depths: config.depths(),
+                seed: config.seed.wrapping_mul(1 << 32),
+            }),
+        };
+        plain.seed(config.seed);
+        let tracked = plain.clone().autodiff();
+        let mut model = FreeRange::new(&config.model, &tracked)?;
+        let o = &config.optimizer;
+        let mut optimizer = AdamWConfig::new()
+            .with_weight_decay(o.weight_decay)
+            .with_beta_1(o.betas.0)
+            .with_beta_2(o.betas.1)
+            .with_epsilon(1e-8)
+            .init();
+
+        let saved = latest_state(folder)?;
+        let (state, average) = match &saved {
+            Some(path) => {
+                progress(&format!("continuing from {}", path.display()));
+                let state = |name: &str| path.join(name);
+                let broken = |name: &str, e: String| FlowError::State { path: path.join(name), problem: e };
+                let record = |name: &str| ModuleRecord::load(state(name)).map_err(|e| broken(name, e.to_string()));
+                let average = model.clone().valid();
+                let average = average.try_load_record(record("average")?).map_err(|e| broken("average", e.to_string()))?;
+                model = model.try_load_record(record("model")?).map_err(|e| broken("model", e.to_string()))?;
+                optimizer = optimizer.load(state("optimizer")).map_err(|e| broken("optimizer", e.to_string()))?;
+                let file = state("progress.json");
+                let text = std::fs::read_to_string(&file).map_err(|source| FlowError::Io { path: file.clone(), source })?;
+                let progress = serde_json::from_str::<Progress>(&text)
+                    .map_err(|e| FlowError::State { path: file, problem: e.to_string() })?;
+                (progress, Weights::of(&average))
+            }
+            None => {
+                let mut square = [0.0; channel::COUNT];
+                let normalization = match initial {
+                    Some(checkpoint) => {
+                        model = Weights::of(&checkpoint.model).apply(model);
+                        square = checkpoint.gradient_rms.map(|x| x * x);
+                        checkpoint.normalization.clone()
+                    }
+                    None => {
+                        let count = config.data.statistics_objects as u64;
+                        progress(&format!("measuring the statistics of {count} objects"));
+                        measure(source.as_ref(), count, config.stages.last().map_or(0, |s| s.depth))?
+                    }
+                };
+                let state = Progress { step: 0, seconds: 0.0, gradient_square: square, normalization };
+                (state, Weights::of(&model))
+            }
+        };
+
+        let first = state.step * config.data.fresh as u64;
+        let mut stream = Stream::start(source.clone(), first, config.data.workers);
+        progress(&format!("filling the window with {} objects", config.data.window));
+        let window = (0..config.data.window).map(|_| Ok(Arc::new(stream.next()?)));
+        let window = window.collect::<Result<VecDeque<_>, FlowError>>()?;
+        Ok(Self {
+            photometric: Photometric::new(&state.normalization, &plain),
+            config,
+            device: plain,
+            model,
+            average,
+            optimizer,
+            progress: state,
+            source,
+            stream,
+            window,
+            folder: folder.into(),
+        })
+    }
+
+    /// Steps taken so far.
+    pub fn step_count(&self) -> u64 {
+        self.progress.step
+    }
+
+    /// The configuration of the run.
+    pub fn config(&self) -> &TrainConfig {
+        &self.config
+    }
+
+    /// Takes one step.
+    pub fn step(&mut self) -> Result<Report, FlowError> {
+        let begin = Instant::now();
+        let index = self.progress.step;
+        let stage = self.config.stage(index).clone();
+        let mut rng = step_rng(self.config.seed, index);
+        let count = self.window.len();
+        let chosen: Vec<Arc<Object>> = match stage.batch <= count {
+            true => sample_indices(&mut rng, count, stage.batch).into_iter().map(|i| self.window[i].clone()).collect(),
+            false => (0..stage.batch).map(|i| self.window[i % count].clone()).collect(),
+        };
+        let model_config = ModelConfig { image_size: stage.image_size, ..self.config.model.clone() };
+        let loss = &self.config.loss;
+        let batch =
+            Batch::draw(&chosen, &stage, &model_config, loss, &self.progress.normalization, &mut rng, &self.device)?;
+        for _ in 0..self.config.data.fresh {
+            self.window.push_back(Arc::new(self.stream.next()?));
+            self.window.pop_front();
+        }
+        let data_seconds = begin.elapsed().as_secs_f64();
+
+        let rms = Tensor::<1>::from_floats(self.gradient_rms(), &self.device).reshape([1, 1, channel::COUNT]);
+        let losses = train::step(&self.model, batch, &self.photometric, &rms, loss, &self.device)?;
+        let total = losses.total.clone().inner().into_scalar::<f32>();
+        self.require_finite("loss", total)?;
+        let mut gradients = GradientsParams::from_grads(losses.total.backward(), &self.model);
+        let o = &self.config.optimizer;
+        let norm = clip_global_norm(&mut gradients, &self.model, o.clip, &self.device);
+        self.require_finite("norm of the gradients", norm)?;
+        let rate = o.rate(index, self.config.total_steps());
+        self.model = self.optimizer.step(rate, self.model.clone(), gradients);
+
+        // The average follows closely at first, when the weights still move far.
+        let decay = o.ema.min((1.0 + index as f32) / (10.0 + index as f32));
+        self.average.average(&Weights::of(&self.model), decay);
+        if let Some(square) = losses.gradient_square {
+            let square = square.into_data().to_vec::<f32>().map_err(|_| FlowError::NoGradient)?;
+            // The mean of all steps so far until that is long enough to forget the oldest.
+            let decay = GRADIENT_STATISTIC_DECAY.min(index as f32 / (index as f32 + 1.0));
+            for (mine, new) in self.progress.gradient_square.iter_mut().zip(square) {
+                *mine = decay * *mine + (1.0 - decay) * new;
+            }
+        }
+        let seconds = begin.elapsed().as_secs_f64();
+        self.progress.step += 1;
+        self.progress.seconds += seconds;
+        Ok(Report {
+            step: self.progress.step,
+            loss: total,
+            flow: losses.flow.into_scalar(),
+            seen: losses.seen.into_scalar(),
+            held: losses.held.into_scalar(),
+            gradient_norm: norm,
+            learning_rate: rate,
+            seconds,
+            data_seconds,
+        })
+    }
+
+    fn gradient_rms(&self) -> [f32; channel::COUNT] {
+        // Before the first step nothing is known: one is as good as any, and the channels are clamped.
+        self.progress.gradient_square.map(|x| if x > 0.0 { x.sqrt().max(1e-12) } else { 1.0 })
+    }
+
+    fn require_finite(&self, what: &str, value: f32) -> Result<(), FlowError> {
+        if value.is_finite() {
+            return Ok(());
+        }
+        Err(FlowError::NotFinite {
+            step: self.progress.step,
+            what: what.into(),
+            value,
+            state: latest_state(&self.folder)?.unwrap_or_else(|| self.folder.clone()),
+        })
+    }
+
+    /// Saves everything that [`Trainer::open`] needs to go on, and the checkpoint of the averaged weights beside it.
+    ///
+    /// The state is written into a folder of its own and becomes the latest one by a rename; then older ones go.
+    pub fn save(&self) -> Result<PathBuf, FlowError> {
+        let io = |path: &Path| {
+            let path = path.to_path_buf();
+            move |source| FlowError::Io { path, source }
+        };
+        let target = self.folder.join(format!("state-{:09}", self.progress.step));
+        let partial = self.folder.join("state.partial");
+        if partial.exists() {
+            std::fs::remove_dir_all(&partial).map_err(io(&partial))?;
+        }
+        std::fs::create_dir_all(&partial).map_err(io(&partial))?;
+        let broken = |name: &str, e: String| FlowError::State { path: partial.join(name), problem: e };
+        let average = self.average.apply(self.model.clone().valid());
+        let model = self.model.clone().into_record();
+        model.save(partial.join("model")).map_err(|e| broken("model", e.to_string()))?;
+        let record = average.clone().into_record();
+        record.save(partial.join("average")).map_err(|e| broken("average", e.to_string()))?;
+        self.optimizer.save(partial.join("optimizer")).map_err(|e| broken("optimizer", e.to_string()))?;
+        let file = partial.join("progress.json");
+        let text = serde_json::to_string_pretty(&self.progress).expect("plain numbers");
+        std::fs::write(&file, text).map_err(io(&file))?;
+        if target.exists() {
+            std::fs::remove_dir_all(&target).map_err(io(&target))?;
+        }
+        std::fs::rename(&partial, &target).map_err(io(&target))?;
+        for old in states(&self.folder)? {
+            if old != target {
+                std::fs::remove_dir_all(&old).map_err(io(&old))?;
+            }
+        }
+        let path = self.folder.join("checkpoint.safetensors");
+        self.checkpoint(average)?.save(&path)?;
+        Ok(path)
+    }
+
+    /// The averaged weights with everything that sampling needs.
+    fn checkpoint(&self, average: FreeRange) -> Result<Checkpoint, FlowError> {
+        let stage = self.config.stage(self.progress.step.saturating_sub(1));
+        let config = ModelConfig { image_size: stage.image_size, ..self.config.model.clone() };
+        let provenance = serde_json::json!({
+            "configuration": self.config,
+            "steps": self.progress.step,
+            "samples": self.samples(),
+            "training_seconds": self.progress.seconds,
+            "program": concat!("freerange ", env!("CARGO_PKG_VERSION")),
+            "sample": self.config.sample,
+        });
+        Ok(Checkpoint {
+            config,
+            model: average,
+            normalization: self.progress.normalization.clone(),
+            gradient_rms: self.gradient_rms(),
+            depth: stage.depth,
+            provenance,
+        })
+    }
+
+    /// Objects seen so far, counting repetitions.
+    fn samples(&self) -> u64 {
+        let mut left = self.progress.step;
+        self.config.stages.iter().fold(0, |sum, stage| {
+            let steps = left.min(stage.steps);
+            left -= steps;
+            sum + steps * stage.batch as u64
+        })
+    }
+
+    /// The source of objects, for checks on objects that training has not seen.
+    pub fn source(&self) -> &Arc<dyn ObjectSource> {
+        &self.source
+    }
+}
+
+/// Normalisation statistics over the first `count` objects at `depth`.
+fn measure(source: &dyn ObjectSource, count: u64, depth: u32) -> Result<Normalization, FlowError> {
+    use rayon::prelude::*;
+    // Partial statistics are merged in the order of the objects, so that the result does not depend on threads.
+    let parts = (0..count)
+        .into_par_iter()
+        .map(|i| {
+            let mut statistics = Statistics::default();
+            statistics.add(source.object(i)?.slice(depth)?).map_err(freerange_data::DataError::from)?;
+            Ok(statistics)
+        })
+        .collect::<Result<Vec<_>, FlowError>>()?;
+    let mut all = Statistics::default();
+    parts.iter().for_each(|p| all.merge(p));
+    Ok(all.normalization().map_err(freerange_data::DataError::from)?)
+}
+
+/// A run's folder holds its configuration: going on with another one would mix two runs.
+fn check_same_run(config: &TrainConfig, folder: &Path) -> Result<(), FlowError> {
+    let path = folder.join("config.toml");
+    let text = toml::to_string_pretty(config)
+        .map_err(|e| FlowError::State { path: path.clone(), problem: e.to_string() })?;
+    match std::fs::read_to_string(&path) {
+        Ok(old) => {
+            let old: TrainConfig = toml::from_str(&old)
+                .map_err(|e| FlowError::State { path: path.clone(), problem: e.to_string() })?;
+            // Running longer is no other run; neither is sampling otherwise, or with more threads.
+            let essence = |c: &TrainConfig| {
+                let mut c = c.clone();
+                c.stages.iter_mut().for_each(|s| s.steps = 0);
+                c.sample = Default::default();
+                c.data.workers = 0;
+                c
+            };
+            if essence(&old) != essence(config) {
+                let problem = "the folder belongs to a run with another configuration: choose another folder".into();
+                return Err(FlowError::State { path, problem });
+            }
+        }
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => {}
+        Err(source) => return Err(FlowError::Io { path, source }),
+    }
+    std::fs::write(&path, text).map_err(|source| FlowError::Io { path, source })
+}
+
+fn states(folder: &Path) -> Result<Vec<PathBuf>, FlowError> {
+    let entries = std::fs::read_dir(folder).map_err(|source| FlowError::Io { path: folder.into(), source })?;
+    let mut found: Vec<PathBuf> = entries
+        .filter_map(|e| e.ok().map(|e| e.path()))
+        .filter(|p| {
+            p.file_name().and_then(|n| n.to_str()).and_then(|n| n.strip_prefix("state-")).is_some_and(|n| n.parse::<u64>().is_ok())
+        })
+        .collect();
+    found.sort();
+    Ok(found)
+}
+
+fn latest_state(folder: &Path) -> Result<Option<PathBuf>, FlowError> {
+    Ok(states(folder)?.pop())
+}

@@ -1,0 +1,34 @@
+/// What can be wrong with a configuration or a mesh.
+#[derive(Debug, thiserror::Error)]
+pub enum MeshError {
+    /// A configuration value out of its range.
+    #[error("{field}: expected {expected}, found {found}")]
+    Config {
+        /// Name of the field.
+        field: &'static str,
+        /// What is allowed.
+        expected: &'static str,
+        /// What was given.
+        found: String,
+    },
+    /// A mesh whose arrays do not fit together.
+    #[error("mesh {field}: expected {expected}, found {found}")]
+    Mesh {
+        /// Name of the array.
+        field: &'static str,
+        /// What is required.
+        expected: String,
+        /// What was found.
+        found: String,
+    },
+}
+
+/// Fails unless `ok`.
+pub(crate) fn check(
+    ok: bool,
+    field: &'static str,
+    expected: &'static str,
+    found: impl std::fmt::Debug,
+) -> Result<(), MeshError> {
+    if ok { Ok(()) } else { Err(MeshError::Config { field, expected, found: format!("{found:?}") }) }
+}

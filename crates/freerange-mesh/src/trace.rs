@@ -1,0 +1,88 @@
+//! Ray queries against a triangle mesh.
+
+use std::time::Duration;
+
+use glam::{Vec2, Vec3, Vec3A};
+use obvhs::BvhBuildParams;
+use obvhs::cwbvh::CwBvh;
+use obvhs::cwbvh::builder::build_cwbvh_from_tris;
+use obvhs::ray::{Ray, RayHit};
+use obvhs::rt_triangle::RtTriangle;
+use obvhs::triangle::Triangle;
+
+/// Slack of the inside test in barycentric coordinates: rays through a shared edge must not slip between.
+const EDGE: f32 = -1e-6;
+
+/// The nearest intersection.
+#[derive(Clone, Copy, Debug)]
+pub struct RawHit {
+    /// Distance in units of the ray's direction.
+    pub t: f32,
+    /// Triangle index in the mesh.
+    pub triangle: u32,
+    /// Weights of the second and third corner.
+    pub bary: Vec2,
+    /// True if the ray met the triangle from behind.
+    pub back: bool,
+}
+
+/// A bounding volume hierarchy over triangles.
+pub struct Tracer {
+    bvh: CwBvh,
+    /// In the order of the hierarchy's leaves.
+    triangles: Vec<RtTriangle>,
+}
+
+fn intersect(t: &RtTriangle, ray: &Ray) -> f32 {
+    let c = t.v0 - ray.origin;
+    let r = ray.direction.cross(c);
+    let inv_det = 1.0 / t.ng.dot(ray.direction);
+    let (u, v) = (r.dot(t.e2) * inv_det, r.dot(t.e1) * inv_det);
+    // Comparisons with NaN (a ray in the plane of the triangle) are false, so that is a miss.
+    if u >= EDGE && v >= EDGE && u + v <= 1.0 - EDGE {
+        let distance = t.ng.dot(c) * inv_det;
+        if distance >= ray.tmin && distance <= ray.tmax {
+            return distance;
+        }
+    }
+    f32::INFINITY
+}
+
+impl Tracer {
+    pub fn new(corners: impl Iterator<Item = [Vec3; 3]>) -> Self {
+        let triangles: Vec<Triangle> =
+            corners.map(|[a, b, c]| Triangle { v0: a.into(), v1: b.into(), v2: c.into() }).collect();
+        let params = BvhBuildParams { pre_split: false, ..BvhBuildParams::fast_build() };
+        let bvh = build_cwbvh_from_tris(&triangles, params, &mut Duration::default());
+        let triangles = bvh.primitive_indices.iter().map(|&i| RtTriangle::from(&triangles[i as usize])).collect();
+        Self { bvh, triangles }
+    }
+
+    /// The nearest intersection beyond `tmin`.
+    pub fn closest(&self, origin: Vec3, direction: Vec3, tmin: f32) -> Option<RawHit> {
+        let ray = Ray::new(origin.into(), direction.into(), tmin, f32::INFINITY);
+        let mut hit = RayHit::none();
+        self.bvh.ray_traverse(ray, &mut hit, |ray, id| intersect(&self.triangles[id], ray));
+        let t = self.triangles.get(hit.primitive_id as usize)?;
+        let det = t.ng.dot(ray.direction);
+        let r = ray.direction.cross(t.v0 - ray.origin);
+        Some(RawHit {
+            t: hit.t,
+            triangle: self.bvh.primitive_indices[hit.primitive_id as usize],
+            bary: Vec2::new(r.dot(t.e2), r.dot(t.e1)) / det,
+            // The stored normal points inwards.
+            back: det < 0.0,
+        })
+    }
+
+    /// True if anything lies along the ray beyond `tmin`.
+    pub fn occluded(&self, origin: Vec3, direction: Vec3, tmin: f32) -> bool {
+        let ray = Ray::new(origin.into(), direction.into(), tmin, f32::INFINITY);
+        !self.bvh.ray_traverse_miss(ray, |ray, id| intersect(&self.triangles[id], ray))
+    }
+
+    /// Outward unit normal of the plane through three corners.
+    pub fn plane_normal([a, b, c]: [Vec3; 3]) -> Vec3 {
+        Vec3A::from(b - a).cross((c - a).into()).normalize_or_zero().into()
+    }
+}

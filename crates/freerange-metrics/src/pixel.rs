@@ -1,0 +1,34 @@
+//! Measures that look at each value alone.
+
+use crate::MetricsError;
+
+fn mean_over(first: &[f32], second: &[f32], term: impl Fn(f64) -> f64) -> Result<f64, MetricsError> {
+    if first.len() != second.len() {
+        return Err(MetricsError::Mismatch { first: first.len(), second: second.len() });
+    }
+    if first.is_empty() {
+        return Err(MetricsError::Empty);
+    }
+    let sum: f64 = first.iter().zip(second).map(|(&a, &b)| term(f64::from(a) - f64::from(b))).sum();
+    Ok(sum / first.len() as f64)
+}
+
+/// Mean squared error over all values of two equally long images.
+pub fn mse(first: &[f32], second: &[f32]) -> Result<f64, MetricsError> {
+    mean_over(first, second, |d| d * d)
+}
+
+/// Mean absolute error over all values of two equally long images.
+pub fn l1(first: &[f32], second: &[f32]) -> Result<f64, MetricsError> {
+    mean_over(first, second, f64::abs)
+}
+
+/// Peak signal-to-noise ratio in dB for a peak of 1, from the MSE over all values; infinite for identical images.
+pub fn psnr(first: &[f32], second: &[f32]) -> Result<f64, MetricsError> {
+    mse(first, second).map(psnr_from_mse)
+}
+
+/// PSNR in dB of a mean squared error, for a peak of 1.
+pub fn psnr_from_mse(mse: f64) -> f64 {
+    -10.0 * mse.log10()
+}

@@ -1,0 +1,338 @@
+//! Every size of the model, with the paper's values as defaults.
+
+use serde::{Deserialize, Serialize};
+
+use crate::ModelError;
+
+/// Channels per Gaussian.
+pub const CHANNELS: usize = freerange_splat::channel::COUNT;
+/// Channels of a Plücker ray: moment, direction.
+pub const PLUCKER: usize = 6;
+
+/// Sizes of the whole network. The defaults are the paper's.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ModelConfig {
+    /// Side of the square input images in pixels; a multiple of the encoder's patch.
+    pub image_size: u32,
+    /// How images become tokens.
+    pub encoder: EncoderConfig,
+    /// Width `d` of the transformer.
+    pub hidden: usize,
+    /// Number of transformer blocks.
+    pub blocks: usize,
+    /// Attention heads; divides `hidden`.
+    pub heads: usize,
+    /// Inner width of the feed-forward network; 4 x `hidden` where left out.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub ffn: Option<usize>,
+    /// Learned tokens that belong to neither image nor Gaussian.
+    pub registers: usize,
+    /// How many neighbours in the tree's order share one token: 1, 2, 4 or 8.
+    pub gaussians_per_token: usize,
+    /// Width of the sinusoidal embedding of the time; even.
+    pub time_features: usize,
+    /// Width of the sinusoidal embedding of a patch's position; a multiple of 4.
+    pub position_features: usize,
+    /// What stands before the output projection.
+    pub final_layer: FinalLayer,
+    /// Whether the photometric gradient is an input beside the noisy Gaussians.
+    pub gradient_channels: bool,
+}
+
+/// How images become tokens.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "snake_case")]
+pub enum EncoderConfig {
+    /// Raw pixels of each patch; needs no outside weights.
+    Patch(PatchConfig),
+    /// Frozen DINOv2.
+    Dinov2(Dinov2Config),
+}
+
+/// The encoder without outside weights.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct PatchConfig {
+    /// Side of a patch in pixels.
+    pub patch_size: u32,
+    /// 3 (RGB) or 4 (RGB and alpha).
+    pub channels: usize,
+    /// Width of a small network on the pixels of each patch; 0: the pixels themselves.
+    pub patch_hidden: usize,
+}
+
+/// Architecture of a DINOv2; the defaults are `facebook/dinov2-base`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Dinov2Config {
+    /// Width.
+    pub hidden: usize,
+    /// Number of blocks.
+    pub layers: usize,
+    /// Attention heads.
+    pub heads: usize,
+    /// Side of a patch in pixels.
+    pub patch_size: u32,
+    /// Side of the square image for which the position embedding is stored, in pixels.
+    pub image_size: u32,
+    /// Inner width of the feed-forward network over `hidden`.
+    pub mlp_ratio: usize,
+    /// SwiGLU instead of GELU in the feed-forward network.
+    pub swiglu: bool,
+    /// Register tokens; 0 for the first generation of published weights.
+    pub registers: usize,
+    /// Epsilon of the layer norms.
+    pub layer_norm_eps: f64,
+    /// Whether queries, keys and values have a bias.
+    pub qkv_bias: bool,
+    /// Whether the position embedding is shrunk with an antialiasing filter (published: only with registers).
+    pub antialias: bool,
+}
+
+/// What stands before the output projection.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum FinalLayer {
+    /// A layer norm modulated by the time, as in DiT.
+    Adaln,
+    /// Nothing.
+    Linear,
+}
+
+impl Default for ModelConfig {
+    fn default() -> Self {
+        Self {
+            image_size: 518,
+            encoder: EncoderConfig::Dinov2(Dinov2Config::default()),
+            hidden: 1024,
+            blocks: 18,
+            heads: 16,
+            ffn: None,
+            registers: 32,
+            gaussians_per_token: 2,
+            time_features: 256,
+            position_features: 32,
+            final_layer: FinalLayer::Adaln,
+            gradient_channels: true,
+        }
+    }
+}
+
+impl Default for PatchConfig {
+    fn default() -> Self {
+        Self { patch_size: 16, channels: 4, patch_hidden: 0 }
+    }
+}
+
+impl Default for Dinov2Config {
+    fn default() -> Self {
+        Self {
+            hidden: 768,
+            layers: 12,
+            heads: 12,
+            patch_size: 14,
+            image_size: 518,
+            mlp_ratio: 4,
+            swiglu: false,
+            registers: 0,
+            layer_norm_eps: 1e-6,
+            qkv_bias: true,
+            antialias: false,
+        }
+    }
+}
+
+impl Dinov2Config {
+    /// Inner width of the feed-forward network. SwiGLU keeps the parameter count: two thirds, rounded up to 8.
+    pub fn ffn_width(&self) -> usize {
+        let inner = self.hidden * self.mlp_ratio;
+        if self.swiglu { (inner * 2 / 3).div_ceil(8) * 8 } else { inner }
+    }
+
+    /// Patches along a side of the image for which the position embedding is stored.
+    pub fn position_side(&self) -> usize {
+        (self.image_size / self.patch_size) as usize
+    }
+
+    /// Checks every size.
+    pub fn validate(&self) -> Result<(), ModelError> {
+        within("encoder.hidden", self.hidden, 1, 16_384)?;
+        within("encoder.layers", self.layers, 1, 512)?;
+        within("encoder.heads", self.heads, 1, 1_024)?;
+        within("encoder.patch_size", self.patch_size as usize, 1, 256)?;
+        within("encoder.image_size", self.image_size as usize, self.patch_size as usize, 8_192)?;
+        within("encoder.mlp_ratio", self.mlp_ratio, 1, 64)?;
+        within("encoder.registers", self.registers, 0, 1_024)?;
+        divides("encoder.heads", self.heads, "encoder.hidden", self.hidden)?;
+        if !(self.layer_norm_eps > 0.0 && self.layer_norm_eps < 1.0) {
+            return Err(ModelError::config("encoder.layer_norm_eps", "a number between 0 and 1", self.layer_norm_eps));
+        }
+        Ok(())
+    }
+}
+
+impl EncoderConfig {
+    /// Side of a patch in pixels.
+    pub fn patch_size(&self) -> u32 {
+        match self {
+            Self::Patch(c) => c.patch_size,
+            Self::Dinov2(c) => c.patch_size,
+        }
+    }
+
+    /// Channels of the input images: 3 (RGB) or 4 (RGB and alpha).
+    pub fn channels(&self) -> usize {
+        match self {
+            Self::Patch(c) => c.channels,
+            Self::Dinov2(_) => 3,
+        }
+    }
+
+    /// Appearance features per patch, before position, colour and ray are appended.
+    pub fn features(&self) -> usize {
+        match self {
+            Self::Patch(c) if c.patch_hidden > 0 => c.patch_hidden,
+            Self::Patch(c) => c.channels * (c.patch_size * c.patch_size) as usize,
+            Self::Dinov2(c) => c.hidden,
+        }
+    }
+}
+
+impl ModelConfig {
+    /// Inner width of the feed-forward network.
+    pub fn ffn_width(&self) -> usize {
+        self.ffn.unwrap_or(4 * self.hidden)
+    }
+
+    /// Width of one attention head.
+    pub fn head_width(&self) -> usize {
+        self.hidden / self.heads
+    }
+
+    /// Channels of the input images: 3 (RGB) or 4 (RGB and alpha).
+    pub fn image_channels(&self) -> usize {
+        self.encoder.channels()
+    }
+
+    /// Patches along a side of an input image.
+    pub fn patches_per_side(&self) -> usize {
+        (self.image_size / self.encoder.patch_size()) as usize
+    }
+
+    /// Width of an image token before the input projection: features, position, mean colour, Plücker ray.
+    pub fn image_token_width(&self) -> usize {
+        self.encoder.features() + self.position_features + 3 + PLUCKER
+    }
+
+    /// Width of a Gaussian token before the input projection.
+    pub fn gaussian_channels(&self) -> usize {
+        self.gaussians_per_token * CHANNELS * if self.gradient_channels { 2 } else { 1 }
+    }
+
+    /// Tokens in the transformer for `views` images and `gaussians` Gaussians.
+    pub fn tokens(&self, views: usize, gaussians: usize) -> usize {
+        self.registers + views * self.patches_per_side().pow(2) + gaussians / self.gaussians_per_token
+    }
+
+    /// Checks every size; anything this accepts can be built, given the memory.
+    pub fn validate(&self) -> Result<(), ModelError> {
+        within("hidden", self.hidden, 1, 16_384)?;
+        within("blocks", self.blocks, 1, 512)?;
+        within("heads", self.heads, 1, 1_024)?;
+        within("ffn", self.ffn_width(), 1, 131_072)?;
+        within("registers", self.registers, 0, 4_096)?;
+        within("time_features", self.time_features, 2, 16_384)?;
+        within("position_features", self.position_features, 0, 4_096)?;
+        divides("heads", self.heads, "hidden", self.hidden)?;
+        if !self.time_features.is_multiple_of(2) {
+            return Err(ModelError::config("time_features", "an even number", self.time_features));
+        }
+        if !self.position_features.is_multiple_of(4) {
+            return Err(ModelError::config("position_features", "a multiple of 4", self.position_features));
+        }
+        if ![1, 2, 4, 8].contains(&self.gaussians_per_token) {
+            return Err(ModelError::config("gaussians_per_token", "1, 2, 4 or 8", self.gaussians_per_token));
+        }
+        match &self.encoder {
+            EncoderConfig::Patch(c) => {
+                within("encoder.patch_size", c.patch_size as usize, 1, 256)?;
+                within("encoder.channels", c.channels, 3, 4)?;
+                within("encoder.patch_hidden", c.patch_hidden, 0, 16_384)?;
+            }
+            EncoderConfig::Dinov2(c) => c.validate()?,
+        }
+        within("image_size", self.image_size as usize, self.encoder.patch_size() as usize, 8_192)?;
+        if !self.image_size.is_multiple_of(self.encoder.patch_size()) {
+            let expected = format!("a multiple of the encoder's patch size {}", self.encoder.patch_size());
+            return Err(ModelError::config("image_size", expected, self.image_size));
+        }
+        Ok(())
+    }
+}
+
+fn within(field: &'static str, value: usize, low: usize, high: usize) -> Result<(), ModelError> {
+    if (low..=high).contains(&value) {
+        return Ok(());
+    }
+    Err(ModelError::config(field, format!("a whole number between {low} and {high}"), value))
+}
+
+fn divides(field: &'static str, value: usize, of: &str, whole: usize) -> Result<(), ModelError> {
+    if whole.is_multiple_of(value) {
+        return Ok(());
+    }
+    Err(ModelError::config(field, format!("a divisor of {of} = {whole}"), value))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn defaults_are_the_papers() {
+        let config = ModelConfig::default();
+        config.validate().unwrap();
+        assert_eq!((config.image_token_width(), config.gaussian_channels()), (809, 56));
+        assert_eq!((config.head_width(), config.ffn_width()), (64, 4096));
+        let small = ModelConfig { image_size: 224, ..config };
+        assert_eq!(small.tokens(4, 2048), 32 + 4 * 256 + 1024);
+    }
+
+    #[test]
+    fn a_file_may_name_any_part() {
+        let text = "hidden = 64\nheads = 4\nimage_size = 64\n[encoder]\nkind = \"patch\"\npatch_size = 8\nchannels = 3\n";
+        let config: ModelConfig = toml::from_str(text).unwrap();
+        config.validate().unwrap();
+        assert_eq!(config.ffn_width(), 256);
+        assert_eq!(config.image_token_width(), 3 * 64 + 41);
+        let again: ModelConfig = toml::from_str(&toml::to_string(&config).unwrap()).unwrap();
+        assert_eq!(again, config);
+    }
+
+    #[test]
+    fn unknown_fields_are_refused() {
+        assert!(toml::from_str::<ModelConfig>("hiden = 64").unwrap_err().to_string().contains("hiden"));
+        let text = "[encoder]\nkind = \"patch\"\npatchsize = 8\n";
+        assert!(toml::from_str::<ModelConfig>(text).unwrap_err().to_string().contains("patchsize"));
+    }
+
+    #[test]
+    fn nonsense_is_refused_by_name() {
+        let good = ModelConfig::default;
+        let cases: [(&str, ModelConfig); 8] = [
+            ("heads", ModelConfig { heads: 5, ..good() }),
+            ("heads", ModelConfig { heads: 0, ..good() }),
+            ("hidden", ModelConfig { hidden: 0, ..good() }),
+            ("gaussians_per_token", ModelConfig { gaussians_per_token: 3, ..good() }),
+            ("time_features", ModelConfig { time_features: 7, ..good() }),
+            ("position_features", ModelConfig { position_features: 30, ..good() }),
+            ("image_size", ModelConfig { image_size: 512, ..good() }),
+            ("blocks", ModelConfig { blocks: usize::MAX, ..good() }),
+        ];
+        for (name, config) in cases {
+            let message = config.validate().unwrap_err().to_string();
+            assert!(message.contains(&format!("`{name}`")), "{message}");
+        }
+    }
+}

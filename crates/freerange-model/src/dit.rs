@@ -1,0 +1,236 @@
+//! The diffusion transformer: one sequence of registers, image tokens and Gaussian tokens.
+//!
+//! Blocks are DiT's (Peebles and Xie 2023, adaLN-Zero) with QK RMS norm and GEGLU. The network predicts the clean
+//! Gaussians. Gaussian tokens carry no position: which Gaussian is which follows from its noise alone.
+
+use burn::{
+    module::{Module, Param},
+    tensor::{Tensor, TensorData, activation::silu},
+};
+
+use crate::{
+    ModelConfig, ModelError,
+    config::{CHANNELS, FinalLayer},
+    layers::{Builder, Init, Linear, NormWeight, Source},
+    ops,
+};
+
+/// The diffusion transformer.
+#[derive(Module, Debug)]
+pub struct Dit {
+    registers: Param<Tensor<2>>, // [registers, d]
+    img_in: Linear,
+    gs_in: Linear,
+    t_mlp: TimeMlp,
+    blocks: Vec<Block>,
+    output: Output,
+    gaussians_per_token: usize,
+    gradient_channels: bool,
+    time_features: usize,
+}
+
+#[derive(Module, Debug)]
+struct TimeMlp {
+    first: Linear,
+    second: Linear,
+}
+
+#[derive(Module, Debug)]
+struct Block {
+    adaln: Linear,
+    attn: Attention,
+    ffn: FeedForward,
+}
+
+#[derive(Module, Debug)]
+struct Attention {
+    qkv: Linear,
+    q_norm: NormWeight,
+    k_norm: NormWeight,
+    out: Linear,
+    heads: usize,
+}
+
+#[derive(Module, Debug)]
+struct FeedForward {
+    proj_in: Linear,
+    proj_out: Linear,
+}
+
+#[derive(Module, Debug)]
+struct Output {
+    adaln: Option<Linear>,
+    linear: Linear,
+}
+
+/// Sinusoidal embedding of the time: cosines, then sines, of 1000 t at periods from 2 pi to 2 pi x 10^4 (DiT).
+///
+/// `t`: `[b]` in 0..1; returns `[b, features]`.
+pub fn time_embedding(t: Tensor<1>, features: usize) -> Tensor<2> {
+    let half = features / 2;
+    let frequencies: Vec<f32> =
+        (0..half).map(|i| (1000.0 * (-(10_000f64.ln()) * i as f64 / half as f64).exp()) as f32).collect();
+    let frequencies = Tensor::<1>::from_data(TensorData::new(frequencies, [half]), &t.device());
+    let angle = t.unsqueeze_dim::<2>(1) * frequencies.unsqueeze_dim::<2>(0); // [b, half]
+    Tensor::cat(vec![angle.clone().cos(), angle.sin()], 1)
+}
+
+impl Attention {
+    /// `x` `[b, t, d]`; the result only for the last `queries` tokens, `[b, queries, d]`.
+    fn forward(&self, x: Tensor<3>, queries: usize) -> Tensor<3> {
+        let qkv = self.qkv.forward(x); // [b, t, 3 d], rows ordered [3, heads, d / heads]
+        let mixed = ops::attention(qkv, self.q_norm.weight.val(), self.k_norm.weight.val(), self.heads, queries);
+        self.out.forward(mixed)
+    }
+}
+
+impl Block {
+    /// `x` `[b, t, d]`, `silu_c` `[b, d]`; returns the last `queries` tokens, `[b, queries, d]`.
+    fn forward(&self, x: Tensor<3>, silu_c: Tensor<2>, queries: usize) -> Tensor<3> {
+        let [_, tokens, _] = x.dims();
+        let [shift_a, scale_a, gate_a, shift_f, scale_f, gate_f] = chunks(self.adaln.forward(silu_c));
+        let y = self.attn.forward(ops::modulated_norm(x.clone(), shift_a, scale_a), queries);
+        let x = if queries == tokens { x } else { x.narrow(1, tokens - queries, queries) };
+        let x = ops::gated_add(x, gate_a, y);
+        let y = self.ffn.proj_in.forward(ops::modulated_norm(x.clone(), shift_f, scale_f)); // [b, t, 2 ffn]
+        let y = self.ffn.proj_out.forward(ops::geglu(y));
+        ops::gated_add(x, gate_f, y)
+    }
+}
+
+/// `[b, n d]` to n times `[b, d]`.
+fn chunks<const N: usize>(m: Tensor<2>) -> [Tensor<2>; N] {
+    let d = m.dims()[1] / N;
+    std::array::from_fn(|i| m.clone().narrow(1, i * d, d))
+}
+
+impl Dit {
+    pub(crate) fn build<S: Source>(
+        config: &ModelConfig,
+        image_channels: usize,
+        prefix: &str,
+        builder: &mut Builder<'_, S>,
+    ) -> Result<Self, ModelError> {
+        let d = config.hidden;
+        let name = |part: &str| format!("{prefix}{part}");
+        // As DiT: modulations and output start at zero, so that every block starts as the identity.
+        Ok(Self {
+            registers: builder.param(&name("registers"), [config.registers, d], Init::Normal(0.02))?,
+            img_in: builder.linear(&name("img_in"), image_channels, d, Init::Xavier)?,
+            gs_in: builder.linear(&name("gs_in"), config.gaussian_channels(), d, Init::Xavier)?,
+            t_mlp: TimeMlp {
+                first: builder.linear(&name("t_mlp.0"), config.time_features, d, Init::Normal(0.02))?,
+                second: builder.linear(&name("t_mlp.2"), d, d, Init::Normal(0.02))?,
+            },
+            blocks: (0..config.blocks)
+                .map(|i| {
+                    let name = |part: &str| format!("{prefix}blocks.{i}.{part}");
+                    Ok(Block {
+                        adaln: builder.linear(&name("adaln"), d, 6 * d, Init::Zeros)?,
+                        attn: Attention {
+                            qkv: builder.linear(&name("attn.qkv"), d, 3 * d, Init::Xavier)?,
+                            q_norm: builder.norm_weight(&name("attn.q_norm"), config.head_width())?,
+                            k_norm: builder.norm_weight(&name("attn.k_norm"), config.head_width())?,
+                            out: builder.linear(&name("attn.out"), d, d, Init::Xavier)?,
+                            heads: config.heads,
+                        },
+                        ffn: FeedForward {
+                            proj_in: builder.linear(&name("ffn.proj_in"), d, 2 * config.ffn_width(), Init::Xavier)?,
+                            proj_out: builder.linear(&name("ffn.proj_out"), config.ffn_width(), d, Init::Xavier)?,
+                        },
+                    })
+                })
+                .collect::<Result<_, ModelError>>()?,
+            output: Output {
+                adaln: match config.final_layer {
+                    FinalLayer::Adaln => Some(builder.linear(&name("final.adaln"), d, 2 * d, Init::Zeros)?),
+                    FinalLayer::Linear => None,
+                },
+                linear: builder.linear(
+                    &name("final.linear"),
+                    d,
+                    config.gaussians_per_token * CHANNELS,
+                    Init::Zeros,
+                )?,
+            },
+            gaussians_per_token: config.gaussians_per_token,
+            gradient_channels: config.gradient_channels,
+            time_features: config.time_features,
+        })
+    }
+
+    /// Width of the time's sinusoidal embedding.
+    pub fn time_features(&self) -> usize {
+        self.time_features
+    }
+
+    /// Whether [`forward`](Self::forward) takes the photometric gradient.
+    pub fn gradient_channels(&self) -> bool {
+        self.gradient_channels
+    }
+
+    /// The conditioning vector of the time: `t` `[b]` in 0..1 to `[b, d]`.
+    pub fn condition(&self, t: Tensor<1>) -> Tensor<2> {
+        self.t_mlp.second.forward(silu(self.t_mlp.first.forward(time_embedding(t, self.time_features))))
+    }
+
+    /// The sequence before the first block: registers, image tokens, Gaussian tokens. `[b, t, d]`
+    fn tokens(&self, noisy: Tensor<3>, gradient: Option<Tensor<3>>, image_tokens: Tensor<3>) -> Tensor<3> {
+        let [b, n, c] = noisy.dims();
+        let p = self.gaussians_per_token;
+        assert_eq!(c, CHANNELS, "the noisy Gaussians have {CHANNELS} channels");
+        assert!(n.is_multiple_of(p), "{n} Gaussians do not fill tokens of {p}");
+        let gaussians = match (self.gradient_channels, gradient) {
+            (true, Some(gradient)) => Tensor::cat(vec![noisy, gradient], 2),
+            (true, None) => Tensor::cat(vec![noisy.clone(), noisy.zeros_like()], 2),
+            (false, None) => noisy,
+            (false, Some(_)) => panic!("this model is configured without gradient channels"),
+        };
+        let width = gaussians.dims()[2] * p;
+        let gaussians = self.gs_in.forward(gaussians.reshape([b, n / p, width]));
+        let mut parts = Vec::with_capacity(3);
+        let registers = self.registers.val(); // [r, d]
+        if registers.dims()[0] > 0 {
+            parts.push(registers.unsqueeze_dim::<3>(0).repeat_dim(0, b));
+        }
+        if image_tokens.dims()[1] > 0 {
+            parts.push(self.img_in.forward(image_tokens));
+        }
+        parts.push(gaussians);
+        Tensor::cat(parts, 1)
+    }
+
+    /// Predicts the clean Gaussians from noisy ones.
+    ///
+    /// - `noisy`: `[b, n, 14]`, normalised; `n` a multiple of `gaussians_per_token`
+    /// - `gradient`: photometric gradient at the noisy Gaussians, scaled to unit RMS, `[b, n, 14]`; `None` is zeros
+    /// - `image_tokens`: `[b, m, image_channels]`; zeros for the unconditional prediction
+    /// - `t`: `[b]`, 0 is noise, 1 is data
+    ///
+    /// Returns the clean Gaussians, normalised, `[b, n, 14]`.
+    ///
+    /// # Panics
+    /// If shapes do not fit each other, or a gradient is given to a model without gradient channels.
+    pub fn forward(
+        &self,
+        noisy: Tensor<3>,
+        gradient: Option<Tensor<3>>,
+        image_tokens: Tensor<3>,
+        t: Tensor<1>,
+    ) -> Tensor<3> {
+        let [b, n, _] = noisy.dims();
+        let gaussian_tokens = n / self.gaussians_per_token;
+        let mut x = self.tokens(noisy, gradient, image_tokens);
+        let silu_c = silu(self.condition(t)); // [b, d]
+        for (i, block) in self.blocks.iter().enumerate() {
+            // Only Gaussian tokens leave the last block, so only they need computing there.
+            let queries = if i + 1 == self.blocks.len() { gaussian_tokens } else { x.dims()[1] };
+            x = block.forward(x, silu_c.clone(), queries);
+        }
+        if let Some(adaln) = &self.output.adaln {
+            let [shift, scale] = chunks(adaln.forward(silu_c));
+            x = ops::modulated_norm(x, shift, scale);
+        }
+        self.output.linear.forward(x).reshape([b, n, CHANNELS])
+    }
+}

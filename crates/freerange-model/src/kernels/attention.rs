@@ -1,0 +1,327 @@
+//! Self-attention with RMS norm of queries and keys, one head of one image at a time.
+//!
+//! Scores exist only for a few query rows at once, and the gradient computes them again from the stored log of each
+//! softmax's denominator (the FlashAttention-2 scheme), so memory is linear in the number of tokens.
+
+use burn::backend::flex::FlexTensor;
+use gemm::Parallelism;
+use multiversion::multiversion;
+use rayon::prelude::*;
+
+use super::{
+    contiguous, dims,
+    linear::{Matrix, matmul},
+    math, tensor, values,
+};
+use crate::ops::EPS;
+
+/// Query rows whose scores exist at once.
+const ROWS: usize = 64;
+
+/// A buffer that several tasks fill in different places.
+#[derive(Clone, Copy)]
+struct Shared(*mut f32);
+// SAFETY: tasks write to disjoint elements only, see each use.
+unsafe impl Send for Shared {}
+// SAFETY: as above.
+unsafe impl Sync for Shared {}
+
+impl Shared {
+    /// # Safety
+    /// `offset` must lie within the buffer.
+    unsafe fn at(self, offset: usize) -> *mut f32 {
+        // SAFETY: the caller's promise.
+        unsafe { self.0.add(offset) }
+    }
+}
+
+/// Sizes of one call.
+#[derive(Clone, Copy)]
+struct Sizes {
+    tokens: usize,
+    queries: usize,
+    heads: usize,
+    width: usize,
+}
+
+impl Sizes {
+    fn d(&self) -> usize {
+        self.heads * self.width
+    }
+
+    /// Where part `part` (0 queries, 1 keys, 2 values) of `head` starts in a row of `qkv`.
+    fn column(&self, part: usize, head: usize) -> usize {
+        (part * self.heads + head) * self.width
+    }
+}
+
+/// Gathers the rows of one head (`stride` apart, from `x[0]`) as `factor weight x / rms(x)`, `[n, width]`.
+#[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma"))]
+fn normalised(x: &[f32], stride: usize, weight: &[f32], factor: f32, out: &mut [f32]) {
+    let width = weight.len();
+    for (i, out) in out.chunks_exact_mut(width).enumerate() {
+        let x = &x[i * stride..][..width];
+        let inverse = factor / (math::sum(x, |x| x * x) / width as f32 + EPS).sqrt();
+        for ((out, x), w) in out.iter_mut().zip(x).zip(weight) {
+            *out = x * inverse * w;
+        }
+    }
+}
+
+/// Backward of [`normalised`]: turns the gradient rows in `grad` into those of `x`, and adds to that of `weight`. With
+/// r = 1 / rms(x) and h = weight grad: dx = r (h - x r^2 mean(h x)).
+#[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma"))]
+fn normalised_backward(
+    x: &[f32],
+    stride: usize,
+    weight: &[f32],
+    factor: f32,
+    grad: &mut [f32],
+    d_weight: &mut [f32],
+) {
+    let width = weight.len();
+    for (i, grad) in grad.chunks_exact_mut(width).enumerate() {
+        let x = &x[i * stride..][..width];
+        let inverse = 1.0 / (math::sum(x, |x| x * x) / width as f32 + EPS).sqrt();
+        for j in 0..width {
+            let g = grad[j] * factor;
+            d_weight[j] += g * x[j] * inverse;
+            grad[j] = g * weight[j];
+        }
+        let mean = math::sum2(grad, x, |h, x| h * x) / width as f32 * inverse * inverse;
+        for j in 0..width {
+            grad[j] = inverse * (grad[j] - x[j] * mean);
+        }
+    }
+}
+
+/// Turns each row of scores into exp(score - largest); stores 1 / sum and the log of the softmax's denominator.
+#[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma"))]
+fn softmax_rows(scores: &mut [f32], tokens: usize, inverse_sum: &mut [f32], log_sum: &mut [f32]) {
+    for (i, row) in scores.chunks_exact_mut(tokens).enumerate() {
+        let largest = math::max(row);
+        for s in row.iter_mut() {
+            *s = math::exp(*s - largest);
+        }
+        let sum = math::sum(row, |p| p);
+        inverse_sum[i] = 1.0 / sum;
+        log_sum[i] = largest + sum.ln();
+    }
+}
+
+/// Scores to probabilities.
+#[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma"))]
+fn probabilities(scores: &mut [f32], tokens: usize, log_sum: &[f32]) {
+    for (row, log_sum) in scores.chunks_exact_mut(tokens).zip(log_sum) {
+        for s in row.iter_mut() {
+            *s = math::exp(*s - log_sum);
+        }
+    }
+}
+
+/// Softmax backward: `dp` becomes p (dp - delta).
+#[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma"))]
+fn score_gradients(p: &[f32], dp: &mut [f32], tokens: usize, delta: &[f32]) {
+    for ((p, dp), delta) in p.chunks_exact(tokens).zip(dp.chunks_exact_mut(tokens)).zip(delta) {
+        for (dp, p) in dp.iter_mut().zip(p) {
+            *dp = p * (*dp - delta);
+        }
+    }
+}
+
+fn scale_row(row: &mut [f32], factor: f32) {
+    row.iter_mut().for_each(|x| *x *= factor);
+}
+
+/// See [`super::Kernels::attention_forward`].
+pub fn forward(
+    qkv: FlexTensor,
+    q_weight: FlexTensor,
+    k_weight: FlexTensor,
+    heads: usize,
+    queries: usize,
+) -> (FlexTensor, FlexTensor) {
+    let (qkv, q_weight, k_weight) = (contiguous(qkv), contiguous(q_weight), contiguous(k_weight));
+    let [b, tokens, d3] = dims(&qkv);
+    let sizes = Sizes { tokens, queries, heads, width: d3 / 3 / heads };
+    let d = sizes.d();
+    assert!(d * 3 == d3 && queries <= tokens, "attention: heads and queries fit the tokens");
+    let (xs, wq, wk) = (values(&qkv), values(&q_weight), values(&k_weight));
+    let mut out = vec![0f32; b * queries * d];
+    let mut log_sum = vec![0f32; b * heads * queries];
+    let target = Shared(out.as_mut_ptr());
+    log_sum.par_chunks_mut(queries.max(1)).enumerate().for_each(|(task, log_sum)| {
+        let (batch, head) = (task / heads, task % heads);
+        let rows = &xs[batch * tokens * d3..][..tokens * d3];
+        // SAFETY: this task alone writes this image's rows at this head's columns, all within `out`.
+        unsafe {
+            let out = target.at(batch * queries * d + head * sizes.width);
+            head_forward(rows, wq, wk, sizes, head, out, log_sum);
+        }
+    });
+    (tensor(out, &[b, queries, d]), tensor(log_sum, &[b, heads, queries]))
+}
+
+/// # Safety
+/// `out` must be valid for `queries` rows of `width` values, `d` apart, that nothing else touches.
+unsafe fn head_forward(
+    rows: &[f32],
+    wq: &[f32],
+    wk: &[f32],
+    sizes: Sizes,
+    head: usize,
+    out: *mut f32,
+    log_sum: &mut [f32],
+) {
+    let Sizes { tokens, queries, width, .. } = sizes;
+    let stride = 3 * sizes.d();
+    let mut k = vec![0f32; tokens * width];
+    normalised(&rows[sizes.column(1, head)..], stride, wk, 1.0, &mut k);
+    let v = Matrix::rows(&rows[sizes.column(2, head)..], stride);
+    let mut q = vec![0f32; ROWS * width];
+    let mut scores = vec![0f32; ROWS * tokens];
+    let mut inverse_sum = [0f32; ROWS];
+    for first in (0..queries).step_by(ROWS) {
+        let n = ROWS.min(queries - first);
+        let start = (tokens - queries + first) * stride + sizes.column(0, head);
+        normalised(&rows[start..], stride, wq, (width as f32).sqrt().recip(), &mut q[..n * width]);
+        let (q, k) = (Matrix::rows(&q, width), Matrix::rows(&k, width).transposed());
+        // SAFETY: `scores` is ours; the rows of `out` are by the caller's promise.
+        unsafe {
+            matmul([n, width, tokens], q, k, 1.0, scores.as_mut_ptr(), tokens, false, Parallelism::None);
+            softmax_rows(&mut scores[..n * tokens], tokens, &mut inverse_sum, &mut log_sum[first..first + n]);
+            let out = out.add(first * sizes.d());
+            let p = Matrix::rows(&scores, tokens);
+            matmul([n, tokens, width], p, v, 1.0, out, sizes.d(), false, Parallelism::None);
+            for i in 0..n {
+                scale_row(std::slice::from_raw_parts_mut(out.add(i * sizes.d()), width), inverse_sum[i]);
+            }
+        }
+    }
+}
+
+/// See [`super::Kernels::attention_backward`].
+pub fn backward(
+    qkv: FlexTensor,
+    q_weight: FlexTensor,
+    k_weight: FlexTensor,
+    out: FlexTensor,
+    log_sum: FlexTensor,
+    grad: FlexTensor,
+    heads: usize,
+) -> [FlexTensor; 3] {
+    let (qkv, q_weight, k_weight) = (contiguous(qkv), contiguous(q_weight), contiguous(k_weight));
+    let (out, log_sum, grad) = (contiguous(out), contiguous(log_sum), contiguous(grad));
+    let [b, tokens, d3] = dims(&qkv);
+    let [_, queries, d] = dims(&out);
+    let sizes = Sizes { tokens, queries, heads, width: d / heads };
+    let (xs, wq, wk) = (values(&qkv), values(&q_weight), values(&k_weight));
+    let (outs, log_sums, grads) = (values(&out), values(&log_sum), values(&grad));
+    let mut d_qkv = vec![0f32; xs.len()];
+    let target = Shared(d_qkv.as_mut_ptr());
+    let d_weights: Vec<_> = (0..b * heads)
+        .into_par_iter()
+        .map(|task| {
+            let (batch, head) = (task / heads, task % heads);
+            let saved = Saved {
+                rows: &xs[batch * tokens * d3..][..tokens * d3],
+                out: &outs[batch * queries * d..][..queries * d],
+                grad: &grads[batch * queries * d..][..queries * d],
+                log_sum: &log_sums[task * queries..][..queries],
+            };
+            // SAFETY: this task alone writes this image's rows at this head's columns, all within `d_qkv`.
+            unsafe { head_backward(saved, wq, wk, sizes, head, target.at(batch * tokens * d3)) }
+        })
+        .collect();
+    let (mut d_wq, mut d_wk) = (vec![0f32; sizes.width], vec![0f32; sizes.width]);
+    for (wq, wk) in &d_weights {
+        math::add(&mut d_wq, wq);
+        math::add(&mut d_wk, wk);
+    }
+    [tensor(d_qkv, &[b, tokens, d3]), tensor(d_wq, &[sizes.width]), tensor(d_wk, &[sizes.width])]
+}
+
+/// What the gradient of one head needs of its image.
+#[derive(Clone, Copy)]
+struct Saved<'a> {
+    rows: &'a [f32],    // [tokens, 3 d]
+    out: &'a [f32],     // [queries, d]
+    grad: &'a [f32],    // [queries, d]
+    log_sum: &'a [f32], // [queries]
+}
+
+/// Returns the gradients of both norm weights.
+///
+/// # Safety
+/// `d_rows` must be valid for `tokens` rows of `3 d` values, of which nothing else touches this head's columns.
+unsafe fn head_backward(
+    saved: Saved<'_>,
+    wq: &[f32],
+    wk: &[f32],
+    sizes: Sizes,
+    head: usize,
+    d_rows: *mut f32,
+) -> (Vec<f32>, Vec<f32>) {
+    let Sizes { tokens, queries, width, .. } = sizes;
+    let (d, stride) = (sizes.d(), 3 * sizes.d());
+    let factor = (width as f32).sqrt().recip();
+    let q_rows = &saved.rows[(tokens - queries) * stride + sizes.column(0, head)..];
+    let k_rows = &saved.rows[sizes.column(1, head)..];
+    let mut q = vec![0f32; queries * width];
+    let mut k = vec![0f32; tokens * width];
+    if queries > 0 {
+        normalised(q_rows, stride, wq, factor, &mut q);
+    }
+    normalised(k_rows, stride, wk, 1.0, &mut k);
+    let v = Matrix::rows(&saved.rows[sizes.column(2, head)..], stride);
+    let (mut dq, mut dk) = (vec![0f32; queries * width], vec![0f32; tokens * width]);
+    let (mut p, mut dp) = (vec![0f32; ROWS * tokens], vec![0f32; ROWS * tokens]);
+    for first in (0..queries).step_by(ROWS) {
+        let n = ROWS.min(queries - first);
+        let head_part = |data: &'_ [f32], i: usize| -> std::ops::Range<usize> {
+            let start = (first + i) * d + head * width;
+            debug_assert!(start + width <= data.len());
+            start..start + width
+        };
+        let delta: [f32; ROWS] = std::array::from_fn(|i| {
+            if i >= n {
+                return 0.0;
+            }
+            let part = head_part(saved.out, i);
+            math::sum2(&saved.out[part.clone()], &saved.grad[part], |o, g| o * g)
+        });
+        let q = Matrix::rows(&q[first * width..], width);
+        let k = Matrix::rows(&k, width);
+        let g = Matrix::rows(&saved.grad[first * d + head * width..], d);
+        let none = Parallelism::None;
+        // SAFETY: all buffers but `d_rows` are ours; its columns of this head's values are by the caller's promise.
+        unsafe {
+            matmul([n, width, tokens], q, k.transposed(), 1.0, p.as_mut_ptr(), tokens, false, none);
+            probabilities(&mut p[..n * tokens], tokens, &saved.log_sum[first..first + n]);
+            let dv = d_rows.add(sizes.column(2, head));
+            matmul([tokens, n, width], Matrix::rows(&p, tokens).transposed(), g, 1.0, dv, stride, first > 0, none);
+            matmul([n, width, tokens], g, v.transposed(), 1.0, dp.as_mut_ptr(), tokens, false, none);
+            score_gradients(&p[..n * tokens], &mut dp[..n * tokens], tokens, &delta);
+            let ds = Matrix::rows(&dp, tokens);
+            matmul([n, tokens, width], ds, k, 1.0, dq[first * width..].as_mut_ptr(), width, false, none);
+            matmul([tokens, n, width], ds.transposed(), q, 1.0, dk.as_mut_ptr(), width, first > 0, none);
+        }
+    }
+    let (mut d_wq, mut d_wk) = (vec![0f32; width], vec![0f32; width]);
+    if queries > 0 {
+        normalised_backward(q_rows, stride, wq, factor, &mut dq, &mut d_wq);
+    }
+    normalised_backward(k_rows, stride, wk, 1.0, &mut dk, &mut d_wk);
+    let store = |rows: &[f32], first_token: usize, column: usize| {
+        for (i, row) in rows.chunks_exact(width).enumerate() {
+            // SAFETY: a row of this head's columns, by the caller's promise.
+            unsafe {
+                let to = d_rows.add((first_token + i) * stride + column);
+                std::ptr::copy_nonoverlapping(row.as_ptr(), to, width);
+            }
+        }
+    };
+    store(&dq, tokens - queries, sizes.column(0, head));
+    store(&dk, 0, sizes.column(1, head));
+    (d_wq, d_wk)
+}

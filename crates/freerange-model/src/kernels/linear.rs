@@ -1,0 +1,145 @@
+//! Matrix products, and the linear layer as products that start from the bias.
+
+use burn::backend::flex::FlexTensor;
+use gemm::Parallelism;
+use rayon::prelude::*;
+
+use super::{contiguous, dims, math, tensor, values};
+
+/// A read-only matrix inside a slice: element (i, j) is `data[i * rows + j * columns]`.
+#[derive(Clone, Copy)]
+pub struct Matrix<'a> {
+    pub data: &'a [f32],
+    pub row_stride: usize,
+    pub column_stride: usize,
+}
+
+impl<'a> Matrix<'a> {
+    /// Row-major with this many values from one row to the next.
+    pub fn rows(data: &'a [f32], row_stride: usize) -> Self {
+        Self { data, row_stride, column_stride: 1 }
+    }
+
+    /// The transpose, without moving anything.
+    pub fn transposed(self) -> Self {
+        Self { row_stride: self.column_stride, column_stride: self.row_stride, ..self }
+    }
+
+    fn holds(&self, rows: usize, columns: usize) -> bool {
+        rows == 0
+            || columns == 0
+            || (rows - 1) * self.row_stride + (columns - 1) * self.column_stride < self.data.len()
+    }
+}
+
+/// `out = (add ? out : 0) + scale a b`, where `a` is `[m, k]`, `b` `[k, n]` and `out` `[m, n]` with this row stride.
+///
+/// # Safety
+/// `out` must be valid for writes of `m` rows of `n` values at that stride, and nothing else may touch those meanwhile.
+pub unsafe fn matmul(
+    [m, k, n]: [usize; 3],
+    a: Matrix,
+    b: Matrix,
+    scale: f32,
+    out: *mut f32,
+    out_row_stride: usize,
+    add: bool,
+    parallelism: Parallelism,
+) {
+    assert!(a.holds(m, k) && b.holds(k, n), "matrix product out of bounds");
+    // SAFETY: the operands were checked above; the caller vouches for `out`.
+    unsafe {
+        gemm::gemm(
+            m,
+            n,
+            k,
+            out,
+            1,
+            out_row_stride as isize,
+            add,
+            a.data.as_ptr(),
+            a.column_stride as isize,
+            a.row_stride as isize,
+            b.data.as_ptr(),
+            b.column_stride as isize,
+            b.row_stride as isize,
+            1.0,
+            scale,
+            false,
+            false,
+            false,
+            parallelism,
+        );
+    }
+}
+
+/// Below this many multiplications, starting threads costs more than it saves.
+fn parallelism(shape: [usize; 3]) -> Parallelism {
+    if shape.iter().product::<usize>() < 1 << 22 { Parallelism::None } else { Parallelism::Rayon(0) }
+}
+
+/// A whole product into a new or prepared `[m, n]` buffer.
+fn product(shape: [usize; 3], a: Matrix, b: Matrix, out: &mut [f32], add: bool) {
+    assert_eq!(out.len(), shape[0] * shape[2]);
+    // SAFETY: `out` is exclusively borrowed and has m rows of n values.
+    unsafe { matmul(shape, a, b, 1.0, out.as_mut_ptr(), shape[2], add, parallelism(shape)) }
+}
+
+/// Rows per piece of work; fixed, so that sums do not depend on the number of threads.
+const ROWS: usize = 64;
+
+pub fn forward(x: FlexTensor, w: FlexTensor, b: FlexTensor) -> FlexTensor {
+    let (x, w, b) = (contiguous(x), contiguous(w), contiguous(b));
+    let [outputs, inputs] = dims(&w);
+    let mut shape = x.layout().shape().to_vec();
+    assert_eq!(shape.last(), Some(&inputs), "linear: input width");
+    let rows = values(&x).len() / inputs;
+    let bias = values(&b);
+    let mut out = vec![0f32; rows * outputs];
+    out.par_chunks_mut(ROWS * outputs).for_each(|piece| {
+        piece.chunks_exact_mut(outputs).for_each(|row| row.copy_from_slice(bias));
+    });
+    let weight = Matrix::rows(values(&w), inputs).transposed();
+    product([rows, inputs, outputs], Matrix::rows(values(&x), inputs), weight, &mut out, true);
+    if let Some(last) = shape.last_mut() {
+        *last = outputs;
+    }
+    tensor(out, &shape)
+}
+
+pub fn backward(
+    x: FlexTensor,
+    w: FlexTensor,
+    grad: FlexTensor,
+    need_x: bool,
+) -> (Option<FlexTensor>, FlexTensor, FlexTensor) {
+    let (x, w, grad) = (contiguous(x), contiguous(w), contiguous(grad));
+    let [outputs, inputs] = dims(&w);
+    let rows = values(&x).len() / inputs;
+    let g = Matrix::rows(values(&grad), outputs);
+    let dx = need_x.then(|| {
+        let mut dx = vec![0f32; rows * inputs];
+        product([rows, outputs, inputs], g, Matrix::rows(values(&w), inputs), &mut dx, false);
+        tensor(dx, &x.layout().shape().to_vec())
+    });
+    let mut dw = vec![0f32; outputs * inputs];
+    product([outputs, rows, inputs], g.transposed(), Matrix::rows(values(&x), inputs), &mut dw, false);
+    let db = column_sums(values(&grad), outputs);
+    (dx, tensor(dw, &[outputs, inputs]), tensor(db, &[outputs]))
+}
+
+/// Sums over the rows of `[rows, width]`.
+fn column_sums(data: &[f32], width: usize) -> Vec<f32> {
+    let partial: Vec<Vec<f32>> = data
+        .par_chunks(ROWS * width)
+        .map(|piece| {
+            let mut sums = vec![0f32; width];
+            piece.chunks_exact(width).for_each(|row| math::add(&mut sums, row));
+            sums
+        })
+        .collect();
+    let mut total = vec![0f32; width];
+    partial.iter().for_each(|p| math::add(&mut total, p));
+    total
+}
+

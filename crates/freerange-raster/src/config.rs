@@ -1,0 +1,18 @@
+/// Settings of the rasteriser; the defaults are gsplat's.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RasterConfig {
+    /// Gaussians with a smaller camera z are culled. World units.
+    pub near: f32,
+    /// Gaussians with a larger camera z are culled. World units.
+    pub far: f32,
+    /// Added to both variances of a projected Gaussian, in square pixels: nothing is thinner than about a pixel.
+    pub blur: f32,
+    /// Whether to render depth as well.
+    pub depth: bool,
+}
+
+impl Default for RasterConfig {
+    fn default() -> Self {
+        Self { near: 0.01, far: 1e10, blur: 0.3, depth: false }
+    }
+}

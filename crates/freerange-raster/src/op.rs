@@ -1,0 +1,154 @@
+//! The operation on Burn tensors.
+
+use crate::{CHANNELS, RasterConfig, RasterError, cpu};
+use burn::backend::{
+    Autodiff, Backend, Dispatch, Flex,
+    autodiff::{
+        checkpoint::{base::Checkpointer, strategy::CheckpointStrategy},
+        grads::Gradients,
+        ops::{Backward, Ops, OpsKind},
+    },
+    backend_extension,
+    flex::FlexTensor,
+    tensor::FloatTensor,
+};
+use burn::tensor::{DType, Tensor, TensorData};
+use freerange_camera::Camera;
+use std::sync::{Arc, OnceLock};
+
+/// Renders `gaussians` `[objects, n, 14]` (channels as in [`crate`]) with `cameras[object][view]`, in front of
+/// `backgrounds[object][view]`. Returns `[objects, views, height, width, 4]`: colour over the background, and alpha.
+///
+/// Differentiable once in `gaussians`. All objects have the same number of views, and all views the same size in pixels.
+/// What [`crate::render`] says about values that are not finite holds here as well; [`RasterConfig::depth`] is ignored.
+///
+/// # Errors
+/// As [`crate::render`], and if the shape or data type of `gaussians` is not as above. Views are counted through all objects.
+pub fn rasterize(
+    gaussians: Tensor<3>,
+    cameras: &[Vec<Camera>],
+    backgrounds: &[Vec<[f32; 3]>],
+    config: &RasterConfig,
+) -> Result<Tensor<5>, RasterError> {
+    let found = gaussians.dims();
+    let [objects, _, channels] = found;
+    if channels != CHANNELS || objects != cameras.len() {
+        return Err(RasterError::Shape { objects: cameras.len(), found });
+    }
+    if gaussians.dtype() != DType::F32 {
+        return Err(RasterError::DataType { found: format!("{:?}", gaussians.dtype()) });
+    }
+    let views = cameras.first().map_or(0, Vec::len);
+    let lengths = |field, found: usize, expected: usize| {
+        if found == expected { Ok(()) } else { Err(RasterError::Length { field, expected, found }) }
+    };
+    lengths("backgrounds", backgrounds.len(), objects)?;
+    for (cameras, backgrounds) in cameras.iter().zip(backgrounds) {
+        lengths("cameras[object]", cameras.len(), views)?;
+        lengths("backgrounds[object]", backgrounds.len(), views)?;
+    }
+    let (cameras, backgrounds) = (cameras.concat(), backgrounds.concat());
+    let [width, height] = cpu::check(&[], &cameras, &backgrounds, config)?;
+    let config = RasterConfig { depth: false, ..*config };
+    let job = Arc::new(Job { objects, views, width, height, cameras, backgrounds, config });
+    Ok(Tensor::from_dispatch(Dispatch::rasterize(gaussians.into_dispatch(), job, None)))
+}
+
+/// What to render: plain data that travels through the backends.
+#[derive(Debug)]
+pub struct Job {
+    objects: usize,
+    views: usize,
+    width: usize,
+    height: usize,
+    cameras: Vec<Camera>,        // [objects * views]
+    backgrounds: Vec<[f32; 3]>, // [objects * views]
+    config: RasterConfig,
+}
+
+/// Where the forward pass puts what the backward pass needs, if somebody will want it.
+pub type Saved = Arc<OnceLock<cpu::State>>;
+
+/// The backends that can rasterise.
+#[backend_extension(Flex, Autodiff)]
+pub trait RasterOps: Backend {
+    /// `[objects, n, 14]` to `[objects, views, height, width, 4]`.
+    fn rasterize(gaussians: FloatTensor<Self>, job: Arc<Job>, saved: Option<Saved>) -> FloatTensor<Self>;
+    /// `[objects, n, 14]` and d loss / d image to d loss / d Gaussians.
+    fn rasterize_backward(
+        gaussians: FloatTensor<Self>,
+        d_image: FloatTensor<Self>,
+        job: Arc<Job>,
+        saved: Saved,
+    ) -> FloatTensor<Self>;
+}
+
+/// Runs `f` on the tensor's elements in row-major order.
+fn with_slice<T>(tensor: &FlexTensor, f: impl FnOnce(&[f32]) -> T) -> T {
+    match tensor.as_slice::<f32>() {
+        Some(slice) => f(slice),
+        None => f(tensor.to_contiguous().as_slice::<f32>().expect("a contiguous f32 tensor")),
+    }
+}
+
+impl Job {
+    /// Renders into a new image, `[objects, views, height, width, 4]`.
+    fn run(&self, gaussians: &FlexTensor) -> (Vec<f32>, cpu::State) {
+        let mut image = vec![0f32; self.cameras.len() * self.height * self.width * 4];
+        let state = with_slice(gaussians, |rows| {
+            let Self { objects, cameras, backgrounds, config, .. } = self;
+            cpu::forward(rows, *objects, cameras, backgrounds, config, &mut image, 4, &mut [], &mut [])
+        });
+        (image, state)
+    }
+}
+
+impl RasterOps for Flex {
+    fn rasterize(gaussians: FlexTensor, job: Arc<Job>, saved: Option<Saved>) -> FlexTensor {
+        let (image, state) = job.run(&gaussians);
+        if let Some(saved) = saved {
+            saved.set(state).expect("one forward pass per operation");
+        }
+        FlexTensor::from_data(TensorData::new(image, [job.objects, job.views, job.height, job.width, 4]))
+    }
+
+    fn rasterize_backward(gaussians: FlexTensor, d_image: FlexTensor, job: Arc<Job>, saved: Saved) -> FlexTensor {
+        let shape = [job.objects, gaussians.layout().shape()[1], CHANNELS];
+        let state = saved.get_or_init(|| job.run(&gaussians).1);
+        let out = with_slice(&gaussians, |rows| {
+            with_slice(&d_image, |d_image| cpu::backward(rows, state, d_image, 4, &[], &[]))
+        });
+        FlexTensor::from_data(TensorData::new(out.gaussians, shape))
+    }
+}
+
+impl<B: RasterOps, C: CheckpointStrategy> RasterOps for Autodiff<B, C> {
+    fn rasterize(gaussians: FloatTensor<Self>, job: Arc<Job>, saved: Option<Saved>) -> FloatTensor<Self> {
+        #[derive(Debug)]
+        struct Pullback;
+        impl<B: RasterOps> Backward<B, 1> for Pullback {
+            type State = (FloatTensor<B>, Arc<Job>, Saved);
+            fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
+                let d_image = grads.consume::<B>(&ops.node);
+                let (gaussians, job, saved) = ops.state;
+                let [parent] = ops.parents;
+                if let Some(node) = parent {
+                    grads.register::<B>(node.id, B::rasterize_backward(gaussians, d_image, job, saved));
+                }
+            }
+        }
+        let (gaussians, node) = gaussians.into_parts();
+        match Pullback.prepare::<C>([node]).compute_bound().stateful() {
+            OpsKind::Tracked(prep) => {
+                let saved = saved.unwrap_or_default();
+                let image = B::rasterize(gaussians.clone(), job.clone(), Some(saved.clone()));
+                prep.finish((gaussians, job, saved), image)
+            }
+            OpsKind::UnTracked(prep) => prep.finish(B::rasterize(gaussians, job, saved)),
+        }
+    }
+
+    fn rasterize_backward(_: FloatTensor<Self>, _: FloatTensor<Self>, _: Arc<Job>, _: Saved) -> FloatTensor<Self> {
+        panic!("the rasteriser can be differentiated once only")
+    }
+}
