@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use burn::tensor::Device;
-use freerange_camera::{Frame, Similarity, Up, View, canonical_frame, composite};
+use freerange_camera::{CanonicalFrame, FrameConfig, Similarity, Up, View, canonical_from_user, composite};
 use freerange_fit::{RefineConfig, refine};
 use freerange_flow::sample::{SampleConfig, reconstruct};
 use freerange_metrics::{psnr, ssim_3dgs};
@@ -47,7 +47,7 @@ pub struct Reconstruction {
     /// One per seed.
     pub samples: Vec<Sample>,
     /// Where the object was found.
-    pub frame: Frame,
+    pub frame: CanonicalFrame,
     /// Seconds per stage, in order.
     pub seconds: Vec<(&'static str, f64)>,
 }
@@ -61,11 +61,7 @@ pub fn run(
 ) -> Result<Reconstruction, CliError> {
     let mut seconds = Vec::new();
     let begin = Instant::now();
-    let frame = canonical_frame(views, options.up)?;
-    let canonical: Vec<View> = views
-        .iter()
-        .map(|v| View { camera: v.camera.transformed(&frame.canonical_from_user), ..v.clone() })
-        .collect();
+    let (frame, canonical) = to_canonical(views, options.up)?;
     seconds.push(("frame", begin.elapsed().as_secs_f64()));
 
     let begin = Instant::now();
@@ -95,6 +91,14 @@ pub fn run(
         seconds.push(("refine", begin.elapsed().as_secs_f64()));
     }
     Ok(Reconstruction { samples, frame, seconds })
+}
+
+/// The views in the canonical frame, and how they got there.
+pub fn to_canonical(views: &[View], up: Up) -> Result<(CanonicalFrame, Vec<View>), CliError> {
+    let frame = canonical_from_user(views, &FrameConfig { up, ..FrameConfig::default() })?;
+    let moved = |v: &View| View { camera: v.camera.transformed(&frame.canonical_from_user), ..v.clone() };
+    let canonical = views.iter().map(moved).collect();
+    Ok((frame, canonical))
 }
 
 /// Takes a cloud from the canonical frame to the user's.

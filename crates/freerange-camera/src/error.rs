@@ -102,7 +102,7 @@ pub enum CameraError {
         /// The image file.
         image: PathBuf,
         /// The decoder's reason.
-        source: image::ImageError,
+        source: Box<image::ImageError>,
     },
     /// An image's size contradicts the intrinsics.
     #[error(

@@ -58,7 +58,8 @@ fn centres(name: &str) -> Vec<DVec3> {
         return list.iter().map(point).collect();
     }
     let view = |m: &serde_json::Value| {
-        let rows: Vec<f64> = m.as_array().unwrap().iter().flat_map(|r| r.as_array().unwrap().iter().map(number)).collect();
+        let rows: Vec<f64> =
+            m.as_array().unwrap().iter().flat_map(|r| r.as_array().unwrap().iter().map(number)).collect();
         let matrix = DMat4::from_cols_slice(&rows).transpose();
         matrix.inverse().w_axis.truncate()
     };
@@ -75,7 +76,11 @@ fn selections_have_the_required_properties() {
         for seed in 0..8 {
             let config = SelectionConfig { seed, ..Default::default() };
             let sets = select_views(&centres, DVec3::ZERO, &config).unwrap();
-            assert_eq!(sets, select_views(&centres, DVec3::ZERO, &config).unwrap(), "the same seed chooses the same views");
+            assert_eq!(
+                sets,
+                select_views(&centres, DVec3::ZERO, &config).unwrap(),
+                "the same seed chooses the same views"
+            );
             assert_eq!(sets.labels.len(), n);
 
             // A fixed point of Lloyd's iteration, and not a bad one.
@@ -121,14 +126,14 @@ fn selections_have_the_required_properties() {
 
 #[test]
 fn selections_that_cannot_be_made_are_refused() {
-    let ring: Vec<DVec3> = (0..12).map(|i| DVec3::new((i as f64).cos(), (i as f64).sin(), 0.2)).collect();
+    let ring: Vec<DVec3> = (0..24).map(|i| DVec3::new((i as f64).cos(), (i as f64).sin(), 0.2)).collect();
     let choose = |centres: &[DVec3], config: SelectionConfig| select_views(centres, DVec3::ZERO, &config);
     let default = SelectionConfig::default;
     assert!(choose(&ring, default()).is_ok());
     assert!(choose(&ring[..5], default()).is_err());
     assert!(choose(&ring, SelectionConfig { inputs: 1, ..default() }).is_err());
     assert!(choose(&ring, SelectionConfig { validation: 0, ..default() }).is_err());
-    assert!(choose(&[DVec3::X; 12], default()).is_err());
+    assert!(choose(&[DVec3::X; 24], default()).is_err());
     assert!(choose(&[], default()).is_err());
     let mut broken = ring.clone();
     broken[3] = DVec3::NAN;

@@ -39,6 +39,20 @@ pub enum DataError {
         /// The reason.
         source: std::io::Error,
     },
+    /// An object in a shard is not what it should be.
+    #[error("{}: object {sample}, entry {entry}: expected {expected}, found {found}", shard.display())]
+    Sample {
+        /// The shard.
+        shard: PathBuf,
+        /// Key of the object.
+        sample: String,
+        /// The entry, without the key.
+        entry: String,
+        /// What would be accepted.
+        expected: String,
+        /// What is there.
+        found: String,
+    },
     /// A thread that makes objects ended early.
     #[error("the thread that makes object {index} has died")]
     Worker {
@@ -54,6 +68,9 @@ pub enum DataError {
     /// The rasteriser.
     #[error(transparent)]
     Raster(#[from] freerange_raster::RasterError),
+    /// The measures of image quality.
+    #[error(transparent)]
+    Metrics(#[from] freerange_metrics::MetricsError),
     /// The fit.
     #[error(transparent)]
     Fit(#[from] freerange_fit::FitError),

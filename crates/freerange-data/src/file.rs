@@ -56,11 +56,6 @@ impl NewFile {
         }
         Ok((self.bytes, hex(&std::mem::take(&mut self.hash).finalize())))
     }
-
-    /// Where the file will be.
-    pub fn target(&self) -> &Path {
-        &self.target
-    }
 }
 
 impl Write for NewFile {

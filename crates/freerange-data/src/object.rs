@@ -3,11 +3,13 @@
 use std::collections::BTreeMap;
 
 use freerange_camera::View;
-use freerange_mesh::{CameraConfig, GeneratorConfig, LitMesh, LightingConfig, generate, orbit_cameras, render};
+use freerange_fit::FitConfig;
+use freerange_mesh::{CameraConfig, GeneratorConfig, LightingConfig, Scene, generate, orbit_cameras, render};
 use freerange_splat::{Alignment, Cloud, LodTree};
-use rand::{Rng, SeedableRng};
+use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
+use crate::fitted::{fitted_gaussians, polished};
 use crate::{DataError, SurfaceConfig, surface_gaussians};
 
 /// Where an object's Gaussians come from.
@@ -29,17 +31,19 @@ pub struct ObjectConfig {
     pub gaussians: GaussianSource,
     /// The `surface` way.
     pub surface: SurfaceConfig,
+    /// The `fit` way. Its seed is replaced by one drawn for the object.
+    pub fit: FitConfig,
+    /// Gradient steps that adapt each slice of the tree to the views. 0: slices are what the tree says.
+    pub polish: usize,
     /// How the axes of the Gaussians in the tree are labelled.
     pub alignment: Alignment,
     /// Rendered views per object.
     pub views: usize,
-    /// Width and height of a view, in pixels.
-    pub image_size: u32,
     /// Rays per pixel and axis.
     pub samples_per_axis: u32,
     /// Shapes and materials.
     pub generator: GeneratorConfig,
-    /// Where the cameras stand.
+    /// Where the cameras stand, and their resolution.
     pub cameras: CameraConfig,
     /// Environment and sun.
     pub lighting: LightingConfig,
@@ -50,12 +54,13 @@ impl Default for ObjectConfig {
         Self {
             gaussians: GaussianSource::Surface,
             surface: SurfaceConfig::default(),
+            fit: FitConfig::default(),
+            polish: 0,
             alignment: Alignment::Identity,
             views: 40,
-            image_size: 512,
             samples_per_axis: 2,
             generator: GeneratorConfig::default(),
-            cameras: CameraConfig::default(),
+            cameras: CameraConfig { resolution: 512, ..CameraConfig::default() },
             lighting: LightingConfig::default(),
         }
     }
@@ -86,8 +91,8 @@ impl Object {
     pub fn generate(seed: u64, config: &ObjectConfig, depths: &[u32]) -> Result<Self, DataError> {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         rng.set_stream(1);
-        let mesh = LitMesh::new(generate(seed, &config.generator), &config.lighting.draw(&mut rng))?;
-        let cameras = orbit_cameras(config.views, &mut rng, &config.cameras, config.image_size);
+        let mesh = Scene::new(generate(seed, &config.generator)?, &config.lighting.sample(&mut rng))?;
+        let cameras = orbit_cameras(config.views, &mut rng, &config.cameras);
         let views: Vec<View> = cameras
             .into_iter()
             .enumerate()
@@ -99,19 +104,11 @@ impl Object {
             .collect();
         let leaves = match config.gaussians {
             GaussianSource::Surface => surface_gaussians(&mesh, &config.surface, &mut rng),
-            GaussianSource::Fit => todo_fit(&views, rng.random())?,
+            GaussianSource::Fit => fitted_gaussians(&mesh, &views, config, &mut rng)?,
         };
-        let tree = LodTree::build(&leaves, config.alignment)?;
-        let slices = depths.iter().map(|&depth| Ok((depth, tree.slice(depth)?))).collect::<Result<_, DataError>>()?;
+        let tree = LodTree::build_to_depth(&leaves, depths.iter().copied().max().unwrap_or(0), config.alignment)?;
+        let polished = |depth| polished(tree.slice(depth)?, &views, config.polish, seed);
+        let slices = depths.iter().map(|&depth| Ok((depth, polished(depth)?))).collect::<Result<_, DataError>>()?;
         Ok(Self { id: format!("generated-{seed:08}"), views, slices })
     }
-}
-
-/// This build has no fit, and says so.
-fn todo_fit(_views: &[View], _seed: u64) -> Result<Cloud, DataError> {
-    Err(DataError::Config {
-        field: "gaussians".into(),
-        expected: "\"surface\" (this build has no fit)".into(),
-        found: "\"fit\"".into(),
-    })
 }

@@ -85,6 +85,11 @@ pub(crate) struct Place<'a> {
 }
 
 impl Place<'_> {
+    /// Another entry of the same object.
+    pub fn of<'a>(&'a self, entry: &'a str) -> Place<'a> {
+        Place { entry, ..*self }
+    }
+
     pub fn error(&self, expected: impl Into<String>, found: impl ToString) -> DataError {
         DataError::Sample {
             shard: self.shard.into(),
@@ -113,14 +118,14 @@ pub(crate) fn is_key(key: &str) -> bool {
 /// The entries of an object in the order of a shard: what follows `KEY.` in the name, and the bytes.
 /// `shard` is for messages only. Refuses whatever [`Shards`](crate::Shards) would refuse to read.
 pub(crate) fn encode(object: &Object, metadata: &Metadata, shard: &Path) -> Result<Vec<(String, Vec<u8>)>, DataError> {
-    let place = |entry| Place { shard, sample: &object.id, entry };
+    let place = Place { shard, sample: &object.id, entry: METADATA };
     if !is_key(&object.id) || metadata.id != object.id {
-        return Err(place(METADATA).error("an id of 1 to 64 characters A-Z a-z 0-9 - _", format!("{:?}", metadata.id)));
+        return Err(place.error("an id of 1 to 64 characters A-Z a-z 0-9 - _", format!("{:?}", metadata.id)));
     }
-    let json = |entry, value: serde_json::Result<Vec<u8>>| value.map_err(|e| place(entry).error("values JSON can hold", e));
+    let json = |entry, value: serde_json::Result<Vec<u8>>| value.map_err(|e| place.of(entry).error("values JSON can hold", e));
 
     let cameras: Vec<Camera> = object.views.iter().map(|v| v.camera).collect();
-    check_cameras(&cameras, place(CAMERAS))?;
+    check_cameras(&cameras, place.of(CAMERAS))?;
     let views = object.views.iter().map(|v| {
         let Camera { width, height, fx, fy, cx, cy, world_to_camera } = v.camera;
         let world_to_camera = world_to_camera.transpose().to_cols_array_2d();
@@ -130,17 +135,17 @@ pub(crate) fn encode(object: &Object, metadata: &Metadata, shard: &Path) -> Resu
     let mut entries = vec![
         (METADATA.into(), json(METADATA, serde_json::to_vec_pretty(metadata))?),
         (CAMERAS.into(), json(CAMERAS, serde_json::to_vec(&cameras))?),
-        (GAUSSIANS.into(), encode_slices(&object.slices, place(GAUSSIANS))?),
+        (GAUSSIANS.into(), encode_slices(&object.slices, place.of(GAUSSIANS))?),
     ];
     for (i, view) in object.views.iter().enumerate() {
         let name = view_entry(i);
         let size = (view.camera.width, view.camera.height);
         if view.image.dimensions() != size {
             let (w, h) = view.image.dimensions();
-            return Err(place(&name).error(format!("the camera's {} x {} pixels", size.0, size.1), format!("{w} x {h}")));
+            return Err(place.of(&name).error(format!("the camera's {} x {} pixels", size.0, size.1), format!("{w} x {h}")));
         }
         let mut png = Cursor::new(Vec::new());
-        view.image.write_to(&mut png, ImageFormat::Png).map_err(|e| place(&name).error("an image PNG can hold", e))?;
+        view.image.write_to(&mut png, ImageFormat::Png).map_err(|e| place.of(&name).error("an image PNG can hold", e))?;
         entries.push((name, png.into_inner()));
     }
     Ok(entries)

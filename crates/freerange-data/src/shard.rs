@@ -181,13 +181,15 @@ impl ShardReader {
     pub fn read(&self, i: usize, depths: &[u32]) -> Result<Object, DataError> {
         let sample = &self.samples[i];
         let mut file = File::open(&self.path).map_err(io_error(&self.path))?;
-        let place = |entry| Place { shard: &self.path, sample: &sample.key, entry };
+        let place = Place { shard: &self.path, sample: &sample.key, entry: METADATA };
         let cameras = self.bytes(&mut file, sample.cameras)?;
-        let cameras = sample::decode_cameras(&cameras, sample.views.len(), place(CAMERAS))?;
-        let slices = sample::decode_slices(&self.bytes(&mut file, sample.gaussians)?, depths, place(GAUSSIANS))?;
+        let cameras = sample::decode_cameras(&cameras, sample.views.len(), place.of(CAMERAS))?;
+        let slices = sample::decode_slices(&self.bytes(&mut file, sample.gaussians)?, depths, place.of(GAUSSIANS))?;
         let views = cameras.into_iter().zip(&sample.views).enumerate().map(|(k, ((name, camera), &span))| {
             let bytes = self.bytes(&mut file, span)?;
-            sample::decode_view(&bytes, name, camera, place(&sample::view_entry(k)))
+            let entry = sample::view_entry(k);
+            let place = Place { shard: &self.path, sample: &sample.key, entry: &entry };
+            sample::decode_view(&bytes, name, camera, place)
         });
         Ok(Object { id: sample.key.to_string(), views: views.collect::<Result<_, _>>()?, slices })
     }

@@ -1,6 +1,6 @@
 //! Gaussians straight from a mesh: points by area, flat along the normal, coloured as rendered, opaque.
 
-use freerange_mesh::{LitMesh, sample_surface};
+use freerange_mesh::{Scene, sample_surface};
 use freerange_splat::{Cloud, channel};
 use glam::{Mat3, Quat, Vec3};
 use rand_chacha::ChaCha8Rng;
@@ -21,20 +21,20 @@ pub struct SurfaceConfig {
 
 impl Default for SurfaceConfig {
     fn default() -> Self {
-        Self { points: 4096, spread: 0.55, thickness: 0.08, opacity: 0.95 }
+        Self { points: 4096, spread: 0.65, thickness: 0.08, opacity: 0.95 }
     }
 }
 
 /// One Gaussian per surface point.
-pub fn surface_gaussians(mesh: &LitMesh, config: &SurfaceConfig, rng: &mut ChaCha8Rng) -> Cloud {
+pub fn surface_gaussians(mesh: &Scene, config: &SurfaceConfig, rng: &mut ChaCha8Rng) -> Cloud {
     let points = sample_surface(mesh, config.points, rng);
     let logit = (config.opacity / (1.0 - config.opacity)).ln();
     let mut rows = Vec::with_capacity(points.len() * channel::COUNT);
     for p in &points {
         let side = p.area.max(1e-12).sqrt();
         let [along, across] = [config.spread, config.thickness].map(|s| (s * side).ln());
-        let q = tangent_frame(p.normal);
-        rows.extend_from_slice(&p.position.to_array());
+        let q = tangent_frame(Vec3::from(p.normal));
+        rows.extend_from_slice(&p.position);
         rows.extend_from_slice(&[along, along, across]);
         rows.extend_from_slice(&[q.w, q.x, q.y, q.z]);
         rows.push(logit);

@@ -43,6 +43,9 @@ pub enum FitError {
     /// The cloud to start from.
     #[error(transparent)]
     Splat(#[from] freerange_splat::SplatError),
+    /// The rasteriser.
+    #[error(transparent)]
+    Raster(#[from] freerange_raster::RasterError),
     /// The loss.
     #[error(transparent)]
     Metrics(#[from] freerange_metrics::MetricsError),

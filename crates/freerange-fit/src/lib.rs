@@ -1,5 +1,36 @@
 //! 3DGS-MCMC: posed views in, 3D Gaussians out.
+//!
+//! * [`fit`]: from nothing but views (Kheradmand et al. 2024), which is how training objects become clouds.
+//! * [`refine`]: a few gradient steps on a cloud that is already good.
+//!
+//! Plain Rust over the rasteriser's CPU functions; no tensor library.
 
+mod adam;
+mod config;
 mod error;
+mod fit;
+mod init;
+mod mcmc;
+mod objective;
+mod refine;
+#[cfg(test)]
+mod tests;
+mod views;
 
+pub use config::{Background, FitConfig, Rates, RefineConfig};
 pub use error::FitError;
+pub use fit::fit;
+pub use refine::refine;
+
+/// How far [`fit`] or [`refine`] has come.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FitProgress {
+    /// Steps done.
+    pub step: usize,
+    /// Steps in all.
+    pub steps: usize,
+    /// Photometric loss before the last step, on the views it looked at.
+    pub loss: f64,
+    /// Number of Gaussians.
+    pub gaussians: usize,
+}

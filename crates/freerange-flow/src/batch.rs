@@ -3,7 +3,11 @@
 use std::sync::Arc;
 
 use burn::tensor::{Device, Tensor, TensorData};
-use freerange_camera::{PatchLayout, View, plucker, resize_area, to_f32_rgba};
+use freerange_camera::{
+    PatchLayout, View,
+    image_ops::{resize_area, to_f32_rgba},
+    plucker,
+};
 use freerange_data::Object;
 use freerange_model::{FreeRange, ModelConfig};
 use freerange_splat::{Normalization, channel};

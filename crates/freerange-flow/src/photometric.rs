@@ -1,7 +1,7 @@
 //! The photometric loss between renders of Gaussians and images, and its gradient.
 
 use burn::tensor::{Device, Tensor, TensorData};
-use freerange_camera::{Camera, View, composite};
+use freerange_camera::{Camera, View, image_ops::composite};
 use freerange_raster::{RasterConfig, rasterize};
 use freerange_splat::Normalization;
 
@@ -47,14 +47,23 @@ impl Targets {
 pub struct Photometric {
     mean: Tensor<3>, // [1, 1, 14]
     std: Tensor<3>,  // [1, 1, 14]
-    raster: RasterConfig,
+}
+
+/// Image width, in pixels, at which the rasteriser's screen-space blur means what it does in a viewer.
+const VIEWER_WIDTH: f32 = 512.0;
+
+/// The rasteriser for images of `width` pixels that stand for larger ones: its blur, a constant number of pixels,
+/// shrinks with them. Else Gaussians that look right on small images would be too thin on large ones.
+fn raster_for(width: usize) -> RasterConfig {
+    let full = RasterConfig::default();
+    RasterConfig { blur: full.blur * (width as f32 / VIEWER_WIDTH).min(1.0).powi(2), ..full }
 }
 
 impl Photometric {
     /// For Gaussians normalised by `normalization`, on `device`.
     pub fn new(normalization: &Normalization, device: &Device) -> Self {
         let row = |x: &[f32; 14]| Tensor::<1>::from_floats(*x, device).reshape([1, 1, 14]);
-        Self { mean: row(&normalization.mean), std: row(&normalization.std), raster: RasterConfig::default() }
+        Self { mean: row(&normalization.mean), std: row(&normalization.std) }
     }
 
     /// Raw channels from normalised ones. `[b, n, 14]`
@@ -66,7 +75,8 @@ impl Photometric {
     /// for each object. Returns `[b]`.
     pub fn l1(&self, normalized: Tensor<3>, targets: &Targets) -> Result<Tensor<1>, FlowError> {
         let gaussians = self.denormalize(normalized);
-        let render = rasterize(gaussians, &targets.cameras, &targets.backgrounds, &self.raster)?; // [b, v, h, w, 4]
+        let raster = raster_for(targets.images.dims()[3]);
+        let render = rasterize(gaussians, &targets.cameras, &targets.backgrounds, &raster)?; // [b, v, h, w, 4]
         let [b, v, h, w, _] = render.dims();
         let difference = render.narrow(4, 0, 3) - targets.images.clone();
         Ok(difference.abs().reshape([b, v * h * w * 3]).mean_dim(1).reshape([b]))

@@ -221,7 +221,7 @@ pub fn reconstruct(
     };
     let estimate = euler(noise, config.steps, estimate, push)?;
 
-    let raw = photometric.denormalize(estimate).into_data().to_vec::<f32>().map_err(|_| FlowError::NoGradient)?;
+    let raw = photometric.denormalize(estimate).into_data().try_to_vec::<f32>().map_err(|_| FlowError::NoGradient)?;
     let clouds = raw.chunks_exact(n * channel::COUNT).map(|rows| {
         let mut cloud = Cloud::from_rows(rows.to_vec());
         cloud.canonicalize_rotations();

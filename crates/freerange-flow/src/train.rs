@@ -44,7 +44,7 @@ pub fn step(
 
     // Photometric gradient at the noisy sample, as extra input channels; zeroed together with the images, lest it
     // leak them into the unconditional branch.
-    let (hint, gradient_square) = match model.takes_gradient() {
+    let (hint, gradient_square) = match model.dit().gradient_channels() {
         true => {
             let gradient = photometric.gradient(noisy.clone(), &batch.hint)?;
             let [_, n, c] = gradient.dims();

@@ -100,9 +100,8 @@ impl Trainer {
                 seed: config.seed.wrapping_mul(1 << 32),
             }),
         };
-        plain.seed(config.seed);
         let tracked = plain.clone().autodiff();
-        let mut model = FreeRange::new(&config.model, &tracked)?;
+        let mut model = FreeRange::new(&config.model, &mut step_rng(config.seed, u64::MAX), &tracked)?;
         let o = &config.optimizer;
         let mut optimizer = AdamWConfig::new()
             .with_weight_decay(o.weight_decay)
@@ -213,7 +212,7 @@ impl Trainer {
         let decay = o.ema.min((1.0 + index as f32) / (10.0 + index as f32));
         self.average.average(&Weights::of(&self.model), decay);
         if let Some(square) = losses.gradient_square {
-            let square = square.into_data().to_vec::<f32>().map_err(|_| FlowError::NoGradient)?;
+            let square = square.into_data().try_to_vec::<f32>().map_err(|_| FlowError::NoGradient)?;
             // The mean of all steps so far until that is long enough to forget the oldest.
             let decay = GRADIENT_STATISTIC_DECAY.min(index as f32 / (index as f32 + 1.0));
             for (mine, new) in self.progress.gradient_square.iter_mut().zip(square) {

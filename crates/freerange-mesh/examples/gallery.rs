@@ -5,13 +5,15 @@
 use std::error::Error;
 use std::time::{Duration, Instant};
 
-use freerange_mesh::{CameraConfig, GeneratorConfig, LightingConfig, Scene, generate, orbit_cameras, render, sample_surface};
+use freerange_mesh::{
+    CameraConfig, GeneratorConfig, LightingConfig, Scene, generate, orbit_cameras, render, sample_surface,
+};
 use image::{Rgb, RgbImage};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-const TILE: u32 = 160;
-const COLUMNS: u32 = 12;
+const TILE: u32 = 220;
+const COLUMNS: u32 = 8;
 const VIEWS_TIMED: usize = 10;
 
 fn main() -> Result<(), Box<dyn Error>> {

@@ -95,7 +95,7 @@ impl Default for GeneratorConfig {
             upright_share: 0.6,
             lying_share: 0.2,
             white_share: 0.27,
-            pattern_share: 0.5,
+            pattern_share: 0.55,
             gloss_share: 0.4,
         }
     }

@@ -131,7 +131,7 @@ pub fn bowl(a: &mut Assembly, s: &mut Style) {
         let flat = 1.0 - lip;
         let (r, z) = if t < flat || lip == 0.0 {
             let q = t / flat;
-            (foot + (1.0 - foot) * q.powf(1.0 / curve.max(1.0)) * flat + 0.0 * q, h * 0.85 * q.powf(curve))
+            (foot + (1.0 - foot) * q.powf(1.0 / curve.max(1.0)) * flat, h * 0.85 * q.powf(curve))
         } else {
             let q = (t - flat) / lip;
             (foot + (1.0 - foot) * (flat + lip * q), h * (0.85 + 0.15 * q))
@@ -160,7 +160,9 @@ pub fn bowl(a: &mut Assembly, s: &mut Style) {
     ];
     let part = match s.count(0, 10) {
         0 => shapes::lathe(&spans, 48, &shapes::lobed(s.count(5, 14), s.range(0.02, 0.08)), 0.14),
-        1 => shapes::lathe(&spans, 44, &shapes::superellipse(Vec2::new(1.0, s.range(0.5, 1.0)), s.range(2.0, 6.0)), 0.14),
+        1 => {
+            shapes::lathe(&spans, 44, &shapes::superellipse(Vec2::new(1.0, s.range(0.5, 1.0)), s.range(2.0, 6.0)), 0.14)
+        }
         _ => shapes::lathe(&spans, 44, &shapes::round, 0.14),
     };
     a.add(part, CREASE);
@@ -302,11 +304,12 @@ pub fn carton(a: &mut Assembly, s: &mut Style) {
     let faces: [u16; 6] = if s.chance(0.8) {
         let (side, top) = (half.y / half.z, half.x / half.y);
         let front = half.x / half.z;
-        let second_front = s.chance(0.6);
+        let second_side = if s.chance(0.5) { Face::Side } else { Face::Back };
+        let second_front = if s.chance(0.6) { Face::Front } else { Face::Back };
         let faces = [
             s.print(&scheme, Face::Side, side),
-            s.print(&scheme, if s.chance(0.5) { Face::Side } else { Face::Back }, side),
-            s.print(&scheme, if second_front { Face::Front } else { Face::Back }, front),
+            s.print(&scheme, second_side, side),
+            s.print(&scheme, second_front, front),
             s.print(&scheme, Face::Front, front),
             s.print(&scheme, Face::Side, top),
             if s.chance(0.5) { s.plain(scheme.ground) } else { s.print(&scheme, Face::Back, top) },
@@ -373,7 +376,8 @@ pub fn pan(a: &mut Assembly, s: &mut Style) {
     let wall = s.range(0.012, 0.03);
     let flare = s.range(0.04, 0.25).min(0.8 * h);
     let outer = shapes::fillet(&[Vec2::new(0.0, 0.0), Vec2::new(base, 0.0), Vec2::new(r, h)], flare, 5);
-    let edge = vec![Vec2::new(r, h), Vec2::new(r + 0.3 * wall, h + 0.6 * wall), Vec2::new(r - 0.8 * wall, h + 0.6 * wall)];
+    let edge =
+        vec![Vec2::new(r, h), Vec2::new(r + 0.3 * wall, h + 0.6 * wall), Vec2::new(r - 0.8 * wall, h + 0.6 * wall)];
     let inner = shapes::fillet(&[edge[2], Vec2::new(base - wall, wall), Vec2::new(0.0, wall)], flare, 5);
     let spans = [
         Span { points: outer, material: body },
@@ -388,7 +392,11 @@ pub fn pan(a: &mut Assembly, s: &mut Style) {
         let path: Vec<Vec3> = (0..=12)
             .map(|i| {
                 let t = i as f32 / 12.0;
-                Vec3::new(root - 0.4 * wall + length * t, 0.0, start + rise * t + sag * (std::f32::consts::PI * t).sin())
+                Vec3::new(
+                    root - 0.4 * wall + length * t,
+                    0.0,
+                    start + rise * t + sag * (std::f32::consts::PI * t).sin(),
+                )
             })
             .collect();
         let (thick, wide) = (s.range(0.012, 0.035), s.range(0.025, 0.07));
@@ -416,7 +424,8 @@ pub fn pan(a: &mut Assembly, s: &mut Style) {
             // A lid with a knob.
             let z = h + 0.5 * wall;
             let dome = s.range(0.03, 0.2);
-            let points = [Vec2::new(0.0, z), Vec2::new(r, z), Vec2::new(0.6 * r, z + 0.75 * dome), Vec2::new(0.0, z + dome)];
+            let points =
+                [Vec2::new(0.0, z), Vec2::new(r, z), Vec2::new(0.6 * r, z + 0.75 * dome), Vec2::new(0.0, z + dome)];
             let lid = [Span { points: shapes::fillet(&points, 0.1, 4), material: body }];
             a.add(shapes::lathe(&lid, 40, &shapes::round, 0.12), CREASE);
             let k = s.range(0.04, 0.09);

@@ -20,8 +20,8 @@ fn skin(s: &mut Style) -> Texture {
         0..2 => s.range(-0.02, 0.03),
         2..4 => s.range(0.05, 0.11),
         4..6 => s.range(0.12, 0.17),
-        6 => s.range(0.2, 0.33),
-        _ => s.range(0.0, 1.0),
+        6 => s.range(0.18, 0.3),
+        _ => s.range(-0.05, 0.2),
     };
     let a = palette::hsv(hue, s.range(0.55, 0.95), s.range(0.5, 0.98));
     let b = palette::hsv(hue + s.range(-0.06, 0.06), s.range(0.4, 0.9), s.range(0.35, 0.95));
@@ -79,7 +79,8 @@ pub fn fruit(a: &mut Assembly, s: &mut Style) {
                 Vec2::new(top, 0.8),
                 Vec2::new(0.0, 0.97),
             ];
-            let points: Vec<Vec2> = shapes::smooth(&points, 4).into_iter().map(|p| p.max(Vec2::new(0.0, -2.0))).collect();
+            let points: Vec<Vec2> =
+                shapes::smooth(&points, 4).into_iter().map(|p| p.max(Vec2::new(0.0, -2.0))).collect();
             let span = [Span { points, material: body }];
             let lobes = s.count(3, 10);
             let section = shapes::lobed(lobes, if s.chance(0.4) { s.range(0.02, 0.12) } else { 0.0 });
@@ -113,11 +114,10 @@ pub fn fruit(a: &mut Assembly, s: &mut Style) {
 pub fn loaf(a: &mut Assembly, s: &mut Style) {
     let crust = palette::hsv(s.range(0.04, 0.1), s.range(0.5, 0.85), s.range(0.35, 0.8));
     let crumb = palette::hsv(s.range(0.08, 0.14), s.range(0.2, 0.55), s.range(0.75, 0.98));
-    let mut rough = |s: &mut Style, base: Vec3, amount: f32| {
+    let rough = |s: &mut Style, base: Vec3, amount: f32| {
         let b = palette::shade(&mut s.rng, base, amount);
         let scale = Vec3::splat(s.log(6.0, 40.0));
-        let noise =
-            Texture::Noise { a: base, b, scale, octaves: 4, contrast: s.range(1.5, 4.0), seed: s.rng.random() };
+        let noise = Texture::Noise { a: base, b, scale, octaves: 4, contrast: s.range(1.5, 4.0), seed: s.rng.random() };
         Texture::Patches {
             base: Box::new(noise),
             over: Box::new(Texture::Flat(palette::shade(&mut s.rng, base, 0.8))),
@@ -198,9 +198,9 @@ pub fn basket(a: &mut Assembly, s: &mut Style) {
             // Two grip holes.
             1 => !((i + grip.0) % (nu / 2) < 2 * grip.0 && row == grip.1),
             // Slots all around.
-            2 => row == 0 || row + 2 >= rows || i % pu == 0,
+            2 => row == 0 || row + 2 >= rows || i.is_multiple_of(pu),
             // A lattice.
-            _ => row == 0 || row + 1 >= rows || i % pu == 0 || row.is_multiple_of(pv),
+            _ => row == 0 || row + 1 >= rows || i.is_multiple_of(pu) || row.is_multiple_of(pv),
         }
     };
     a.add(shapes::shell([nu, nv], true, |u, v| body(u, v, 0.0), |u, v| body(u, v, wall), keep, m), 40.0);
@@ -299,7 +299,10 @@ pub fn utensil(a: &mut Assembly, s: &mut Style) {
                 Vec3::new(w * dx, deep * (dx * dx + dz * dz - 0.6) + lift, l * (dz + 0.95))
             };
             let t = s.range(0.01, 0.02);
-            a.add(shapes::shell([18, 18], false, |u, v| dish(u, v, -t), |u, v| dish(u, v, t), |_, _| true, [m[1]; 2]), 50.0);
+            a.add(
+                shapes::shell([18, 18], false, |u, v| dish(u, v, -t), |u, v| dish(u, v, t), |_, _| true, [m[1]; 2]),
+                50.0,
+            );
         }
         1 => {
             // A blade, turner or paddle, perhaps slotted.
@@ -321,7 +324,14 @@ pub fn utensil(a: &mut Assembly, s: &mut Style) {
         _ => {
             let (part, crease) = primitive(s, [m[1], m[0]]);
             let size = Vec3::new(s.log(0.08, 0.35), s.log(0.05, 0.3), s.log(0.08, 0.4));
-            a.add(part.transformed(Affine3A::from_scale_rotation_translation(size, Quat::IDENTITY, Vec3::Z * size.z * 0.8)), crease);
+            a.add(
+                part.transformed(Affine3A::from_scale_rotation_translation(
+                    size,
+                    Quat::IDENTITY,
+                    Vec3::Z * size.z * 0.8,
+                )),
+                crease,
+            );
         }
     }
 }
@@ -334,28 +344,38 @@ pub fn stack(a: &mut Assembly, s: &mut Style) {
         palette[0] = s.print(&scheme, Face::Front, 1.5);
     }
     let m = palette.map(|m| a.material(m));
-    let mut z = 0.0;
+    let (mut z, mut width, mut on_legs) = (0.0f32, 0.25f32, false);
     let pieces = s.count(2, 6);
     for _ in 0..pieces {
         let size = Vec3::new(s.log(0.12, 0.6), s.log(0.12, 0.6), s.log(0.06, 0.5));
         let size = if s.chance(0.6) { Vec3::new(size.x, size.x, size.z) } else { size };
+        let size = if on_legs { size.max(Vec3::new(width, width, 0.0)) } else { size };
         let pick = s.count(0, 3);
         let (mut part, crease) = primitive(s, [m[pick], m[(pick + 1) % 3]]);
         if s.chance(0.15) {
             deform(s, &mut part);
         }
-        let shift = Vec3::new(s.range(-0.05, 0.05), s.range(-0.05, 0.05), z + size.z * 0.97);
+        // What the piece really occupies of its unit cube decides where it stands.
+        let (low, high) = part.bounds();
+        let shift = Vec3::new(s.range(-0.05, 0.05), s.range(-0.05, 0.05), z - low.z * size.z);
+        // Legs, wheels, arms: copies around the axis, within the reach of the pieces above and below.
         let copies = if s.chance(0.2) { s.count(2, 5) } else { 1 };
         for c in 0..copies {
             if a.triangle_count() > 6500 {
                 break;
             }
-            // Legs, wheels, arms: copies around the axis.
             let around = Quat::from_rotation_z(TAU * c as f32 / copies as f32);
-            let (out, slim) = if copies > 1 { (around * Vec3::X * 0.3, 0.4) } else { (Vec3::ZERO, 1.0) };
+            let (out, slim) = if copies > 1 { (around * Vec3::X * 0.65 * width, 0.4) } else { (Vec3::ZERO, 1.0) };
             let scale = Vec3::new(size.x * slim, size.y * slim, size.z);
-            a.add(part.clone().transformed(Affine3A::from_scale_rotation_translation(scale, around, shift + out)), crease);
+            a.add(
+                part.clone().transformed(Affine3A::from_scale_rotation_translation(scale, around, shift + out)),
+                crease,
+            );
         }
-        z += 2.0 * size.z * s.range(0.8, 0.99);
+        on_legs = copies > 1;
+        if !on_legs {
+            width = size.x.min(size.y);
+        }
+        z += (high.z - low.z) * size.z * s.range(0.75, 0.98);
     }
 }

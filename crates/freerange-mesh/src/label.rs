@@ -45,7 +45,13 @@ pub struct Scheme {
 
 impl Scheme {
     pub fn random(rng: &mut impl Rng, white_share: f32) -> Self {
-        let tone = if rng.random::<f32>() < white_share { Tone::White } else { *[Tone::Saturated, Tone::Saturated, Tone::Saturated, Tone::Pastel, Tone::Dark, Tone::Brown].choose(rng).unwrap_or(&Tone::Saturated) };
+        let tone = if rng.random::<f32>() < white_share {
+            Tone::White
+        } else {
+            *[Tone::Saturated, Tone::Saturated, Tone::Saturated, Tone::Pastel, Tone::Dark, Tone::Brown]
+                .choose(rng)
+                .unwrap_or(&Tone::Saturated)
+        };
         let ground = palette::color(rng, tone);
         Self {
             ground,

@@ -101,8 +101,12 @@ fn composition(a: &mut Assembly, s: &mut Style) {
             deform(s, &mut part);
         }
         let turn = if s.chance(0.6) { Quat::from_rotation_z(s.range(0.0, TAU)) } else { random_rotation(s) };
-        let place = if i == 0 { Vec3::ZERO } else { anchor(a, s) };
-        part = part.transformed(Affine3A::from_scale_rotation_translation(size * stretch, turn, place));
+        part = part.transformed(Affine3A::from_scale_rotation_translation(size * stretch, turn, Vec3::ZERO));
+        if i > 0 {
+            // A point between the new part's centre and its surface meets a point of the old surface.
+            let own = part.positions[s.count(0, part.positions.len())] * s.range(0.3, 1.0);
+            part = part.moved(anchor(a, s) - own);
+        }
         a.add(part, crease);
     }
 }
@@ -146,7 +150,8 @@ pub fn primitive(s: &mut Style, m: [u16; 2]) -> (Part, f32) {
         }
         60..66 => {
             let r = s.range(0.3, 0.6);
-            let mut points: Vec<Vec2> = (0..=8).map(|i| arc_point(r, -1.0 + r, -FRAC_PI_2 + i as f32 * PI / 16.0)).collect();
+            let mut points: Vec<Vec2> =
+                (0..=8).map(|i| arc_point(r, -1.0 + r, -FRAC_PI_2 + i as f32 * PI / 16.0)).collect();
             points.extend((0..=8).map(|i| arc_point(r, 1.0 - r, i as f32 * PI / 16.0)));
             (lathe_two(s, points, m), 60.0)
         }
@@ -203,7 +208,9 @@ fn lathe_two(s: &mut Style, points: Vec<Vec2>, m: [u16; 2]) -> Part {
             let lobes = s.count(3, 10);
             shapes::lathe(&spans, 48, &shapes::lobed(lobes, s.range(0.05, 0.3)), 0.25)
         }
-        _ => shapes::lathe(&spans, 40, &shapes::superellipse(Vec2::new(1.0, s.range(0.5, 1.0)), s.log(2.0, 10.0)), 0.25),
+        _ => {
+            shapes::lathe(&spans, 40, &shapes::superellipse(Vec2::new(1.0, s.range(0.5, 1.0)), s.log(2.0, 10.0)), 0.25)
+        }
     }
 }
 
@@ -251,7 +258,7 @@ fn slab_with_holes(s: &mut Style, m: [u16; 2]) -> Part {
         let open = if ragged {
             noise::value(Vec3::new(i as f32, j as f32, 0.0) * 0.45, seed) > 0.6
         } else {
-            i % period != 0 && j % period != 0
+            !i.is_multiple_of(period) && !j.is_multiple_of(period)
         };
         border || !open
     };

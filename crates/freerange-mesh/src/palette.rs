@@ -37,14 +37,14 @@ pub fn color(rng: &mut impl Rng, tone: Tone) -> Vec3 {
         }
         Tone::Saturated => {
             // Reds, oranges and yellows, then blues and greens, as packaging has them.
-            let hue = match r.random_range(0..10) {
-                0..3 => r.random_range(-0.03..0.05),
-                3..5 => r.random_range(0.06..0.17),
-                5..7 => r.random_range(0.53..0.66),
-                7..9 => r.random_range(0.22..0.45),
+            let hue = match r.random_range(0..20) {
+                0..7 => r.random_range(-0.03..0.05),
+                7..12 => r.random_range(0.06..0.17),
+                12..16 => r.random_range(0.53..0.66),
+                16..18 => r.random_range(0.2..0.45),
                 _ => r.random::<f32>(),
             };
-            hsv(hue, r.random_range(0.6..1.0), r.random_range(0.4..1.0))
+            hsv(hue, r.random_range(0.55..1.0), r.random_range(0.35..1.0))
         }
         Tone::Pastel => hsv(r.random(), r.random_range(0.12..0.45), r.random_range(0.75..0.98)),
         Tone::Dark => hsv(r.random(), r.random_range(0.0..0.4), r.random_range(0.06..0.3)),

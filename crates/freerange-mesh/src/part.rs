@@ -81,14 +81,6 @@ impl Part {
         self.transformed(Affine3A::from_quat(rotation))
     }
 
-    pub fn append(&mut self, other: &Part) {
-        let base = self.positions.len() as u32;
-        self.positions.extend_from_slice(&other.positions);
-        self.uvs.extend_from_slice(&other.uvs);
-        self.triangles.extend(other.triangles.iter().map(|t| t.map(|i| i + base)));
-        self.materials.extend_from_slice(&other.materials);
-    }
-
     pub fn bounds(&self) -> (Vec3, Vec3) {
         self.positions
             .iter()

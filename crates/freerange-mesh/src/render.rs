@@ -1,43 +1,153 @@
 use freerange_camera::Camera;
-use glam::{DMat3, Vec3};
+use glam::{DMat3, DVec3, Vec3};
 use image::{Rgba, RgbaImage};
 
 use crate::scene::Scene;
 use crate::texture::linear_to_srgb;
 
+/// Points closer to the camera plane than this are not projected.
+const NEAR: f64 = 1e-3;
+
+/// No triangle at a sample.
+const NOTHING: u32 = u32::MAX;
+
 /// Renders a view with `samples_per_axis` squared samples per pixel (at least one): straight alpha, sRGB-encoded,
 /// transparent black where nothing is hit. Runs on the calling thread.
 pub fn render(scene: &Scene, camera: &Camera, samples_per_axis: u32) -> RgbaImage {
-    let n = samples_per_axis.max(1);
-    let mut image = RgbaImage::new(camera.width, camera.height);
-    let rotation = DMat3::from_mat4(camera.world_to_camera).transpose().as_mat3();
-    let origin = camera.center().as_vec3();
-    let scale = [1.0 / camera.fx as f32, 1.0 / camera.fy as f32];
-    let (cx, cy) = (camera.cx as f32, camera.cy as f32);
-    let [x0, y0, x1, y1] = window(scene, camera);
-    for y in y0..y1 {
-        for x in x0..x1 {
-            let (mut sum, mut hits) = (Vec3::ZERO, 0u32);
-            for k in 0..n * n {
-                let px = x as f32 + ((k % n) as f32 + 0.5) / n as f32;
-                let py = y as f32 + ((k / n) as f32 + 0.5) / n as f32;
-                let direction = (rotation * Vec3::new((px - cx) * scale[0], (py - cy) * scale[1], 1.0)).normalize();
-                if let Some(hit) = scene.intersect(origin, direction) {
-                    let surface = scene.surface(hit.triangle as usize, hit.bary);
-                    // Clamped per sample: a highlight must not bleed over the silhouette.
-                    sum += scene.radiance(&surface, -direction).clamp(Vec3::ZERO, Vec3::ONE);
-                    hits += 1;
-                }
-            }
-            if hits > 0 {
-                let c = sum / hits as f32;
-                let code = |v: f32| (255.0 * linear_to_srgb(v) + 0.5) as u8;
-                let alpha = (255.0 * hits as f32 / (n * n) as f32 + 0.5) as u8;
-                image.put_pixel(x, y, Rgba([code(c.x), code(c.y), code(c.z), alpha]));
-            }
+    let grid = Grid::new(scene, camera, samples_per_axis.max(1));
+    let visible = grid.rasterize(scene).unwrap_or_else(|| grid.trace(scene));
+    grid.shade(scene, &visible)
+}
+
+/// The samples of the pixels that the object can cover, row by row.
+struct Grid<'a> {
+    camera: &'a Camera,
+    rotation: glam::Mat3,
+    origin: Vec3,
+    /// First pixel.
+    x0: u32,
+    y0: u32,
+    /// Samples per row and column.
+    columns: usize,
+    rows: usize,
+    per_axis: u32,
+}
+
+impl<'a> Grid<'a> {
+    fn new(scene: &Scene, camera: &'a Camera, per_axis: u32) -> Self {
+        let [x0, y0, x1, y1] = window(scene, camera);
+        let size = |a: u32, b: u32| (b.saturating_sub(a) * per_axis) as usize;
+        Self {
+            camera,
+            rotation: DMat3::from_mat4(camera.world_to_camera).transpose().as_mat3(),
+            origin: camera.center().as_vec3(),
+            x0,
+            y0,
+            columns: size(x0, x1),
+            rows: size(y0, y1),
+            per_axis,
         }
     }
-    image
+
+    /// Unit direction of the ray through a sample.
+    fn direction(&self, column: usize, row: usize) -> Vec3 {
+        let n = self.per_axis as f32;
+        let x = self.x0 as f32 + (column as f32 + 0.5) / n - self.camera.cx as f32;
+        let y = self.y0 as f32 + (row as f32 + 0.5) / n - self.camera.cy as f32;
+        (self.rotation * Vec3::new(x / self.camera.fx as f32, y / self.camera.fy as f32, 1.0)).normalize()
+    }
+
+    /// The nearest triangle per sample, by one ray each. `[rows, columns]`
+    fn trace(&self, scene: &Scene) -> Vec<u32> {
+        (0..self.rows * self.columns)
+            .map(|i| {
+                let direction = self.direction(i % self.columns, i / self.columns);
+                scene.intersect(self.origin, direction).map_or(NOTHING, |hit| hit.triangle)
+            })
+            .collect()
+    }
+
+    /// The nearest triangle per sample, by projecting the triangles: the same answer as [`Self::trace`], many times
+    /// faster. None if a vertex lies behind or too close to the camera plane. `[rows, columns]`
+    fn rasterize(&self, scene: &Scene) -> Option<Vec<u32>> {
+        let (camera, n) = (self.camera, f64::from(self.per_axis));
+        // Grid coordinates, in which samples lie at whole numbers, and inverse depth (linear over the image).
+        let projected: Vec<DVec3> = scene
+            .mesh()
+            .positions
+            .iter()
+            .map(|p| {
+                let q = camera.world_to_camera.transform_point3(p.as_dvec3());
+                let w = 1.0 / q.z;
+                let x = (camera.fx * q.x * w + camera.cx - f64::from(self.x0)) * n - 0.5;
+                let y = (camera.fy * q.y * w + camera.cy - f64::from(self.y0)) * n - 0.5;
+                (q.z > NEAR).then_some(DVec3::new(x, y, w))
+            })
+            .collect::<Option<_>>()?;
+        let mut nearest = vec![0.0f32; self.rows * self.columns];
+        let mut visible = vec![NOTHING; self.rows * self.columns];
+        for (id, t) in scene.mesh().triangles.iter().enumerate() {
+            let [a, b, c] = t.map(|v| projected[v as usize]);
+            let area = (b.x - a.x) * (c.y - a.y) - (b.y - a.y) * (c.x - a.x);
+            if area == 0.0 {
+                continue;
+            }
+            let (lo, hi) = (a.min(b).min(c), a.max(b).max(c));
+            let (x0, x1) =
+                (lo.x.ceil().max(0.0) as usize, (hi.x + 1.0).floor().clamp(0.0, self.columns as f64) as usize);
+            let (y0, y1) = (lo.y.ceil().max(0.0) as usize, (hi.y + 1.0).floor().clamp(0.0, self.rows as f64) as usize);
+            // Weights of b and c as affine functions of the grid coordinates; slack keeps shared edges closed.
+            let (ub, vb) = ((c.y - a.y) / area, (a.x - c.x) / area);
+            let (uc, vc) = ((a.y - b.y) / area, (b.x - a.x) / area);
+            for y in y0..y1 {
+                let dy = y as f64 - a.y;
+                for x in x0..x1 {
+                    let dx = x as f64 - a.x;
+                    let (wb, wc) = (dx * ub + dy * vb, dx * uc + dy * vc);
+                    if wb < -1e-9 || wc < -1e-9 || wb + wc > 1.0 + 1e-9 {
+                        continue;
+                    }
+                    let w = (a.z + wb * (b.z - a.z) + wc * (c.z - a.z)) as f32;
+                    let i = y * self.columns + x;
+                    if w > nearest[i] {
+                        nearest[i] = w;
+                        visible[i] = id as u32;
+                    }
+                }
+            }
+        }
+        Some(visible)
+    }
+
+    /// Shades every covered sample and averages them per pixel.
+    fn shade(&self, scene: &Scene, visible: &[u32]) -> RgbaImage {
+        let mut image = RgbaImage::new(self.camera.width, self.camera.height);
+        let n = self.per_axis as usize;
+        for (py, y) in (0..self.rows).step_by(n).zip(self.y0..) {
+            for (px, x) in (0..self.columns).step_by(n).zip(self.x0..) {
+                let (mut sum, mut hits) = (Vec3::ZERO, 0);
+                for row in py..py + n {
+                    for column in px..px + n {
+                        let id = visible[row * self.columns + column];
+                        if id != NOTHING {
+                            let direction = self.direction(column, row);
+                            let surface = scene.surface_along(id as usize, self.origin, direction);
+                            // Clamped per sample: a highlight must not bleed over the silhouette.
+                            sum += scene.radiance(&surface, -direction).clamp(Vec3::ZERO, Vec3::ONE);
+                            hits += 1;
+                        }
+                    }
+                }
+                if hits > 0 {
+                    let c = sum / hits as f32;
+                    let code = |v: f32| (255.0 * linear_to_srgb(v) + 0.5) as u8;
+                    let alpha = (255.0 * hits as f32 / (n * n) as f32 + 0.5) as u8;
+                    image.put_pixel(x, y, Rgba([code(c.x), code(c.y), code(c.z), alpha]));
+                }
+            }
+        }
+        image
+    }
 }
 
 /// Pixel rectangle [x0, y0, x1, y1) that holds the object's projection.
@@ -46,8 +156,8 @@ fn window(scene: &Scene, camera: &Camera) -> [u32; 4] {
     let (mut min, mut max) = ([f64::MAX; 2], [f64::MIN; 2]);
     for corner in 0..8 {
         let pick = |axis: usize| f64::from(if corner >> axis & 1 == 0 { lo[axis] } else { hi[axis] });
-        let p = camera.world_to_camera.transform_point3(glam::DVec3::new(pick(0), pick(1), pick(2)));
-        if p.z < 1e-3 {
+        let p = camera.world_to_camera.transform_point3(DVec3::new(pick(0), pick(1), pick(2)));
+        if p.z < NEAR {
             return [0, 0, camera.width, camera.height];
         }
         let q = [camera.fx * p.x / p.z + camera.cx, camera.fy * p.y / p.z + camera.cy];
@@ -64,4 +174,38 @@ fn window(scene: &Scene, camera: &Camera) -> [u32; 4] {
         ((max[0] + 1.0).ceil() as u32).min(w),
         ((max[1] + 1.0).ceil() as u32).min(h),
     ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{GeneratorConfig, Lighting, generate};
+
+    #[test]
+    fn projected_triangles_and_rays_see_the_same() {
+        for seed in 0..6 {
+            let mesh = generate(seed, &GeneratorConfig::default()).unwrap();
+            let scene = Scene::new(mesh, &Lighting { rays: 1, ..Lighting::default() }).unwrap();
+            let eye = DVec3::new(1.1, -0.8 + 0.3 * seed as f64, 0.6);
+            let camera = Camera::look_at(eye, DVec3::ZERO, DVec3::Z, 0.8, 96, 80);
+            let grid = Grid::new(&scene, &camera, 2);
+            let (a, b) = (grid.rasterize(&scene).unwrap(), grid.trace(&scene));
+            let covered = b.iter().filter(|&&id| id != NOTHING).count();
+            assert!(covered > 300, "seed {seed}: {covered}");
+            // Samples on an edge may choose either neighbour, and a silhouette either side.
+            let differ = a.iter().zip(&b).filter(|(a, b)| a != b).count();
+            let holes = a.iter().zip(&b).filter(|&(&a, &b)| (a == NOTHING) != (b == NOTHING)).count();
+            assert!(differ * 200 <= covered, "seed {seed}: {differ} of {covered} differ");
+            assert!(holes * 1000 <= covered, "seed {seed}: {holes} of {covered} holes");
+        }
+    }
+
+    #[test]
+    fn a_camera_inside_the_object_falls_back_to_rays() {
+        let mesh = generate(1, &GeneratorConfig::default()).unwrap();
+        let scene = Scene::new(mesh, &Lighting { rays: 1, ..Lighting::default() }).unwrap();
+        let camera = Camera::look_at(DVec3::new(0.01, 0.02, 0.0), DVec3::X, DVec3::Z, 1.0, 16, 16);
+        assert!(Grid::new(&scene, &camera, 1).rasterize(&scene).is_none());
+        assert_eq!(render(&scene, &camera, 1).dimensions(), (16, 16));
+    }
 }

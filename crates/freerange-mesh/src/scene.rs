@@ -78,6 +78,18 @@ impl Scene {
         self.mesh.triangles[triangle].iter().all(|&v| self.baked.buried[v as usize])
     }
 
+    /// The point of a triangle's plane that a ray meets, held within the triangle.
+    pub(crate) fn surface_along(&self, triangle: usize, origin: Vec3, direction: Vec3) -> Surface<'_> {
+        let [a, b, c] = self.mesh.corners(triangle);
+        let (e1, e2) = (a - b, c - a);
+        let det = e1.cross(e2).dot(direction);
+        let r = direction.cross(a - origin);
+        let safe = if det.abs() > 1e-20 { 1.0 / det } else { 0.0 };
+        let u = (r.dot(e2) * safe).clamp(0.0, 1.0);
+        let v = (r.dot(e1) * safe).clamp(0.0, 1.0 - u);
+        self.surface(triangle, Vec2::new(u, v))
+    }
+
     pub(crate) fn surface(&self, triangle: usize, bary: Vec2) -> Surface<'_> {
         let corners = self.mesh.triangles[triangle].map(|v| v as usize);
         let w = [1.0 - bary.x - bary.y, bary.x, bary.y];
@@ -116,9 +128,7 @@ impl Scene {
         let sun = self.lighting.sun * self.sun_cosine(s) / PI;
         let body = s.albedo * (s.light + Vec3::splat(sun));
         // The reflection sees roughly what the surface itself sees.
-        body * (1.0 - m.metallic) * (1.0 - m.specular)
-            + s.light * (m.specular * (1.0 - m.metallic))
-            + body * m.metallic
+        body * (1.0 - m.metallic) * (1.0 - m.specular) + s.light * (m.specular * (1.0 - m.metallic)) + body * m.metallic
     }
 
     /// Linear radiance towards a viewer in the unit direction `to_eye`.

@@ -172,7 +172,8 @@ pub fn rounded_box(half: Vec3, radius: f32, materials: [u16; 6]) -> Part {
     // Coordinates along one axis: a few steps over each rounded edge and a coarse grid between.
     let stations = |h: f32, inner: f32| -> Vec<f32> {
         let cells = ((2.0 * inner / 0.16) as usize).clamp(3, 9);
-        let mid = (0..=cells).map(|i| inner * (2.0 * i as f32 / cells as f32 - 1.0));
+        // Exactly symmetric, so that mirrored faces meet in the same points.
+        let mid = (0..=cells).map(|i| inner * ((2 * i) as f32 - cells as f32) / cells as f32);
         if r < 1e-4 {
             return mid.collect();
         }
@@ -280,7 +281,10 @@ pub fn shell(
             for (k, (nx, ny)) in [(x, y - 1), (x + 1, y), (x, y + 1), (x - 1, y)].into_iter().enumerate() {
                 if !kept(nx, ny) {
                     let (p, q) = (ring[k], ring[(k + 1) % 4]);
-                    part.quad([at(front, q.0, q.1), at(front, p.0, p.1), at(rear, p.0, p.1), at(rear, q.0, q.1)], outside);
+                    part.quad(
+                        [at(front, q.0, q.1), at(front, p.0, p.1), at(rear, p.0, p.1), at(rear, q.0, q.1)],
+                        outside,
+                    );
                 }
             }
         }

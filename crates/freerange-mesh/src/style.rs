@@ -100,7 +100,7 @@ impl<'a> Style<'a> {
         let glossy = self.rng.random::<f32>() < self.config.gloss_share;
         Material {
             texture,
-            variation: if self.chance(0.45) { self.range(0.02, 0.25) } else { 0.0 },
+            variation: if self.chance(0.45) { self.range(0.01, 0.15) } else { 0.0 },
             seed: self.rng.random(),
             specular: if glossy || self.chance(0.6) { self.range(0.03, 0.06) } else { 0.0 },
             roughness: if glossy { self.range(0.12, 0.4) } else { self.range(0.45, 1.0) },
@@ -132,12 +132,12 @@ impl<'a> Style<'a> {
         let b = self.partner(a);
         let seed = self.rng.random();
         match self.count(0, 100) {
-            0..8 => {
+            0..6 => {
                 let direction = self.axis();
                 let (lo, hi) = (self.range(-0.4, 0.0), self.range(0.05, 0.4));
                 Texture::Gradient { a, b, direction, range: [lo, hi] }
             }
-            8..18 => {
+            6..15 => {
                 let frequency = self.log(2.0, 20.0);
                 let duty = self.range(0.15, 0.6);
                 Texture::Stripes {
@@ -149,19 +149,17 @@ impl<'a> Style<'a> {
                     soft: if self.chance(0.7) { 0.02 } else { self.range(0.02, 0.4) * duty },
                 }
             }
-            18..24 => {
+            15..20 => {
                 let s = self.log(3.0, 14.0);
                 let scale = if self.chance(0.7) { Vec3::splat(s) } else { Vec3::new(s, s, self.log(3.0, 14.0)) };
                 Texture::Checker { a, b, scale }
             }
-            24..28 => {
+            20..24 => {
                 let cells = Vec2::new(self.count(2, 16) as f32 * 2.0, self.count(2, 12) as f32);
                 Texture::CheckerUv { a, b, cells }
             }
-            28..36 => {
-                Texture::Dots { a, b, scale: self.log(3.0, 14.0), radius: self.range(0.18, 0.5), seed }
-            }
-            36..52 => {
+            24..31 => Texture::Dots { a, b, scale: self.log(3.0, 14.0), radius: self.range(0.18, 0.5), seed },
+            31..47 => {
                 let s = self.log(2.0, 40.0);
                 let stretch = if self.chance(0.3) { Vec3::new(1.0, 1.0, self.log(0.1, 8.0)) } else { Vec3::ONE };
                 Texture::Noise {
@@ -173,8 +171,8 @@ impl<'a> Style<'a> {
                     seed,
                 }
             }
-            52..59 => self.wood(),
-            59..65 => Texture::Marble {
+            47..54 => self.wood(),
+            54..60 => Texture::Marble {
                 a,
                 b,
                 direction: self.axis() * self.log(1.5, 8.0),
@@ -182,18 +180,18 @@ impl<'a> Style<'a> {
                 sharpness: self.range(1.5, 12.0),
                 seed,
             },
-            65..73 => {
+            60..67 => {
                 let edge = if self.chance(0.5) { palette::shade(&mut self.rng, a, 1.2) } else { self.color() };
                 Texture::Voronoi { a, b, edge, scale: self.log(3.0, 16.0), width: self.range(0.03, 0.2), seed }
             }
-            73..83 => {
+            67..76 => {
                 let n = self.count(2, 6);
                 let mut stops: Vec<f32> = (1..n).map(|_| self.rng.random_range(-0.4..0.4)).collect();
                 stops.sort_by(f32::total_cmp);
                 let colors = (0..n).map(|i| if i % 2 == 0 { a } else { self.partner(a) }).collect();
                 Texture::Bands { direction: self.axis(), stops, colors }
             }
-            83..91 => {
+            76..84 => {
                 let over = if self.chance(0.5) { self.speckle(b) } else { Texture::Flat(b) };
                 Texture::Patches {
                     base: Box::new(Texture::Flat(a)),
@@ -204,7 +202,13 @@ impl<'a> Style<'a> {
                     seed,
                 }
             }
-            _ => self.speckle(a),
+            84..91 => self.speckle(a),
+            _ => {
+                let scheme = Scheme { ground: a, ..self.scheme() };
+                let face = if self.chance(0.7) { Face::Front } else { Face::Side };
+                let (w, h) = (self.count(96, 192), self.count(96, 160));
+                Texture::Print(Arc::new(label::draw(&mut self.rng, &scheme, face, w, h)))
+            }
         }
     }
 
@@ -220,7 +224,11 @@ impl<'a> Style<'a> {
         Texture::Wood {
             a,
             b,
-            axis: if self.chance(0.7) { [Vec3::X, Vec3::Y, Vec3::Z][self.count(0, 3)] } else { unit_vector(&mut self.rng) },
+            axis: if self.chance(0.7) {
+                [Vec3::X, Vec3::Y, Vec3::Z][self.count(0, 3)]
+            } else {
+                unit_vector(&mut self.rng)
+            },
             rings: self.log(6.0, 40.0),
             warp: self.range(0.05, 0.4),
             seed: self.rng.random(),

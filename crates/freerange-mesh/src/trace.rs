@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use glam::{Vec2, Vec3, Vec3A};
 use obvhs::BvhBuildParams;
-use obvhs::cwbvh::CwBvh;
-use obvhs::cwbvh::builder::build_cwbvh_from_tris;
+use obvhs::bvh2::Bvh2;
+use obvhs::bvh2::builder::build_bvh2_from_tris;
 use obvhs::ray::{Ray, RayHit};
 use obvhs::rt_triangle::RtTriangle;
 use obvhs::triangle::Triangle;
@@ -28,7 +28,7 @@ pub struct RawHit {
 
 /// A bounding volume hierarchy over triangles.
 pub struct Tracer {
-    bvh: CwBvh,
+    bvh: Bvh2,
     /// In the order of the hierarchy's leaves.
     triangles: Vec<RtTriangle>,
 }
@@ -53,7 +53,7 @@ impl Tracer {
         let triangles: Vec<Triangle> =
             corners.map(|[a, b, c]| Triangle { v0: a.into(), v1: b.into(), v2: c.into() }).collect();
         let params = BvhBuildParams { pre_split: false, ..BvhBuildParams::fast_build() };
-        let bvh = build_cwbvh_from_tris(&triangles, params, &mut Duration::default());
+        let bvh = build_bvh2_from_tris(&triangles, params, &mut Duration::default());
         let triangles = bvh.primitive_indices.iter().map(|&i| RtTriangle::from(&triangles[i as usize])).collect();
         Self { bvh, triangles }
     }

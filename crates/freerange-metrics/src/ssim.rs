@@ -139,6 +139,29 @@ fn rows_of(length: usize) -> Vec<f32> {
     vec![0.0; padded(length)]
 }
 
+/// Row buffers for the five blurred moments E[x], E[y], E[xx], E[yy], E[xy].
+struct Moments {
+    length: usize,
+    down: [Vec<f32>; 5],
+    blurred: [Vec<f32>; 5],
+}
+
+impl Moments {
+    fn new(length: usize) -> Self {
+        let rows = || std::array::from_fn(|_| rows_of(length));
+        Self { length, down: rows(), blurred: rows() }
+    }
+
+    /// The moments of row `i`.
+    fn around(&mut self, x: &[f32], y: &[f32], i: usize, weights: &[f32; TAPS]) -> &[Vec<f32>; 5] {
+        moments_down(x, y, self.length, i, weights, &mut self.down);
+        for (source, target) in self.down.iter().zip(&mut self.blurred) {
+            along(source, weights, &mut target[..self.length.next_multiple_of(LANES)]);
+        }
+        &self.blurred
+    }
+}
+
 /// Mean SSIM of two images `[height, width, 3]` in `[0, 1]`, 3DGS variant: 11 x 11 Gaussian of sigma 1.5, zero
 /// padding, mean over all pixels and channels.
 pub fn ssim_3dgs(first: &[f32], second: &[f32], width: usize, height: usize) -> Result<f64, MetricsError> {
@@ -147,21 +170,8 @@ pub fn ssim_3dgs(first: &[f32], second: &[f32], width: usize, height: usize) -> 
     let sums: Vec<f64> = (0..height)
         .into_par_iter()
         .map_init(
-            || {
-                (
-                    std::array::from_fn(|_| rows_of(length)),
-                    std::array::from_fn(|_| rows_of(length)),
-                    [(); 3].map(|_| vec![0.0; length]),
-                )
-            },
-            |(down, blurred, d): &mut ([Vec<f32>; 5], [Vec<f32>; 5], [Vec<f32>; 3]), i| {
-                moments_down(first, second, length, i, &weights, down);
-                for (source, target) in down.iter().zip(blurred.iter_mut()) {
-                    along(source, &weights, &mut target[..length.next_multiple_of(LANES)]);
-                }
-                let [dx, dxx, dxy] = d;
-                similarity(blurred, dx, dxx, dxy)
-            },
+            || (Moments::new(length), [(); 3].map(|_| vec![0.0; length])),
+            |(moments, [dx, dxx, dxy]), i| similarity(moments.around(first, second, i, &weights), dx, dxx, dxy),
         )
         .collect();
     Ok(sums.iter().sum::<f64>() / first.len() as f64)
@@ -221,14 +231,8 @@ fn accumulate_ssim(
         .zip(by_xy.par_chunks_mut(length))
         .enumerate()
         .map_init(
-            || [(); 2].map(|_| std::array::from_fn(|_| rows_of(length))),
-            |[down, blurred]: &mut [[Vec<f32>; 5]; 2], (i, ((dx, dxx), dxy))| {
-                moments_down(first, second, length, i, &weights, down);
-                for (source, target) in down.iter().zip(blurred.iter_mut()) {
-                    along(source, &weights, &mut target[..length.next_multiple_of(LANES)]);
-                }
-                similarity(blurred, dx, dxx, dxy)
-            },
+            || Moments::new(length),
+            |moments, (i, ((dx, dxx), dxy))| similarity(moments.around(first, second, i, &weights), dx, dxx, dxy),
         )
         .collect();
 

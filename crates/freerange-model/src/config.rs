@@ -301,7 +301,8 @@ mod tests {
 
     #[test]
     fn a_file_may_name_any_part() {
-        let text = "hidden = 64\nheads = 4\nimage_size = 64\n[encoder]\nkind = \"patch\"\npatch_size = 8\nchannels = 3\n";
+        let text =
+            "hidden = 64\nheads = 4\nimage_size = 64\n[encoder]\nkind = \"patch\"\npatch_size = 8\nchannels = 3\n";
         let config: ModelConfig = toml::from_str(text).unwrap();
         config.validate().unwrap();
         assert_eq!(config.ffn_width(), 256);

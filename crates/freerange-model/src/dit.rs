@@ -12,7 +12,7 @@ use crate::{
     ModelConfig, ModelError,
     config::{CHANNELS, FinalLayer},
     layers::{Builder, Init, Linear, NormWeight, Source},
-    ops,
+    ops::{self, Compute},
 };
 
 /// The diffusion transformer.
@@ -146,17 +146,21 @@ impl Dit {
                     FinalLayer::Adaln => Some(builder.linear(&name("final.adaln"), d, 2 * d, Init::Zeros)?),
                     FinalLayer::Linear => None,
                 },
-                linear: builder.linear(
-                    &name("final.linear"),
-                    d,
-                    config.gaussians_per_token * CHANNELS,
-                    Init::Zeros,
-                )?,
+                linear: builder.linear(&name("final.linear"), d, config.gaussians_per_token * CHANNELS, Init::Zeros)?,
             },
             gaussians_per_token: config.gaussians_per_token,
             gradient_channels: config.gradient_channels,
             time_features: config.time_features,
         })
+    }
+
+    /// How the blocks' linear layers are computed; the few others stay in f32.
+    pub fn set_compute(&mut self, compute: Compute) {
+        for block in &mut self.blocks {
+            for linear in [&mut block.attn.qkv, &mut block.attn.out, &mut block.ffn.proj_in, &mut block.ffn.proj_out] {
+                linear.set_compute(compute);
+            }
+        }
     }
 
     /// Width of the time's sinusoidal embedding.
@@ -175,7 +179,7 @@ impl Dit {
     }
 
     /// The sequence before the first block: registers, image tokens, Gaussian tokens. `[b, t, d]`
-    fn tokens(&self, noisy: Tensor<3>, gradient: Option<Tensor<3>>, image_tokens: Tensor<3>) -> Tensor<3> {
+    pub(crate) fn tokens(&self, noisy: Tensor<3>, gradient: Option<Tensor<3>>, image_tokens: Tensor<3>) -> Tensor<3> {
         let [b, n, c] = noisy.dims();
         let p = self.gaussians_per_token;
         assert_eq!(c, CHANNELS, "the noisy Gaussians have {CHANNELS} channels");
@@ -198,6 +202,13 @@ impl Dit {
         }
         parts.push(gaussians);
         Tensor::cat(parts, 1)
+    }
+
+    /// The tokens after the first block, for tests.
+    #[cfg(test)]
+    pub(crate) fn first_block(&self, tokens: Tensor<3>, t: Tensor<1>) -> Tensor<3> {
+        let n = tokens.dims()[1];
+        self.blocks[0].forward(tokens, silu(self.condition(t)), n)
     }
 
     /// Predicts the clean Gaussians from noisy ones.

@@ -9,7 +9,7 @@ use burn::{
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal, Uniform};
 
-use crate::{ModelError, ops};
+use crate::{ModelError, ops, ops::Compute};
 
 /// Where the values of a new module come from: random numbers, or a file.
 pub(crate) trait Source {
@@ -61,15 +61,24 @@ impl<S: Source> Builder<'_, S> {
         shape: [usize; D],
         init: Init,
     ) -> Result<Param<Tensor<D>>, ModelError> {
-        let values = self.source.values(name, &shape, init)?;
+        self.reshaped(name, &shape, shape, init)
+    }
+
+    /// A parameter that is stored with other axes, in the same order of values.
+    pub fn reshaped<const D: usize>(
+        &mut self,
+        name: &str,
+        stored: &[usize],
+        shape: [usize; D],
+        init: Init,
+    ) -> Result<Param<Tensor<D>>, ModelError> {
+        let values = self.source.values(name, stored, init)?;
         Ok(Param::from_tensor(Tensor::from_data(TensorData::new(values, shape), self.device)))
     }
 
     pub fn linear(&mut self, name: &str, inputs: usize, outputs: usize, init: Init) -> Result<Linear, ModelError> {
-        Ok(Linear {
-            weight: self.param(&format!("{name}.weight"), [outputs, inputs], init)?,
-            bias: self.param(&format!("{name}.bias"), [outputs], Init::Zeros)?,
-        })
+        let weight = self.param(&format!("{name}.weight"), [outputs, inputs], init)?;
+        Ok(Linear::new(weight, self.param(&format!("{name}.bias"), [outputs], Init::Zeros)?))
     }
 
     pub fn norm_weight(&mut self, name: &str, width: usize) -> Result<NormWeight, ModelError> {
@@ -84,12 +93,22 @@ pub struct Linear {
     pub weight: Param<Tensor<2>>,
     /// `[out]`
     pub bias: Param<Tensor<1>>,
+    #[module(skip)]
+    compute: Compute,
 }
 
 impl Linear {
+    pub(crate) fn new(weight: Param<Tensor<2>>, bias: Param<Tensor<1>>) -> Self {
+        Self { weight, bias, compute: Compute::F32 }
+    }
+
+    pub(crate) fn set_compute(&mut self, compute: Compute) {
+        self.compute = compute;
+    }
+
     /// `[..., in]` to `[..., out]`.
     pub fn forward<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
-        ops::linear(x, self.weight.val(), self.bias.val())
+        ops::linear(x, self.weight.val(), self.bias.val(), self.compute)
     }
 }
 

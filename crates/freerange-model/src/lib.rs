@@ -1,13 +1,28 @@
 //! The network: image encoders, the diffusion transformer, checkpoints.
+//!
+//! [`FreeRange`] is the whole network as one module; [`Checkpoint`] is a trained one with everything that sampling
+//! needs. This crate knows nothing of losses or data.
 
+mod checkpoint;
 mod config;
 mod dit;
+mod encoder;
 mod error;
+mod info;
 mod kernels;
 mod layers;
+mod model;
 mod ops;
+#[cfg(test)]
+mod tests;
+mod weights;
 
+pub use checkpoint::{Checkpoint, Precision};
 pub use config::{CHANNELS, Dinov2Config, EncoderConfig, FinalLayer, ModelConfig, PLUCKER, PatchConfig};
 pub use dit::{Dit, time_embedding};
+pub use encoder::{Dinov2, ImageEncoder, WeightsOrigin, position_embedding};
 pub use error::ModelError;
+pub use info::{ModelInfo, PartInfo, TensorInfo, Workload, dinov2_parameters, tensors};
 pub use layers::{Linear, NormWeight};
+pub use model::{FreeRange, Parameter};
+pub use ops::Compute;

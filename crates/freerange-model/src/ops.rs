@@ -19,12 +19,24 @@ fn is_cpu(device: &Device) -> bool {
     device == &Device::flex()
 }
 
+/// How the products of linear layers are computed. Everything else is in f32 always.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Compute {
+    /// In f32.
+    #[default]
+    F32,
+    /// Operands rounded to bf16, sums in f32. On a CPU without AVX-512 BF16 instructions: in f32.
+    Bf16,
+}
+
 /// `x W^T + b`; `x` `[..., in]`, `w` `[out, in]`, `b` `[out]`.
-pub(crate) fn linear<const D: usize>(x: Tensor<D>, w: Tensor<2>, b: Tensor<1>) -> Tensor<D> {
+pub(crate) fn linear<const D: usize>(x: Tensor<D>, w: Tensor<2>, b: Tensor<1>, compute: Compute) -> Tensor<D> {
     if is_cpu(&x.device()) {
-        return Tensor::from_dispatch(Dispatch::linear_bias(x.into_dispatch(), w.into_dispatch(), b.into_dispatch()));
+        let (x, w, b) = (x.into_dispatch(), w.into_dispatch(), b.into_dispatch());
+        return Tensor::from_dispatch(Dispatch::linear_bias(x, w, b, compute == Compute::Bf16));
     }
-    reference::linear(x, w, b)
+    reference::linear(x, w, b, compute)
 }
 
 /// Layer norm without weights, then `y (1 + scale) + shift`; `x` `[b, t, d]`, `shift` and `scale` `[b, d]`.
@@ -74,16 +86,22 @@ pub(crate) fn attention(
 /// The same operations from Burn's own: any device, differentiated by Burn.
 pub(crate) mod reference {
     use burn::tensor::{
-        Tensor,
+        FloatDType, Tensor,
         activation::gelu,
         module::{attention as scaled_dot_product, linear as burn_linear},
         ops::AttentionModuleOptions,
     };
 
-    use super::EPS;
+    use super::{Compute, EPS};
 
-    pub fn linear<const D: usize>(x: Tensor<D>, w: Tensor<2>, b: Tensor<1>) -> Tensor<D> {
-        burn_linear(x, w.transpose(), Some(b))
+    pub fn linear<const D: usize>(x: Tensor<D>, w: Tensor<2>, b: Tensor<1>, compute: Compute) -> Tensor<D> {
+        match compute {
+            Compute::F32 => burn_linear(x, w.transpose(), Some(b)),
+            Compute::Bf16 => {
+                let (x, w) = (x.cast(FloatDType::BF16), w.cast(FloatDType::BF16));
+                burn_linear(x, w.transpose(), None).cast(FloatDType::F32) + b.unsqueeze::<D>()
+            }
+        }
     }
 
     pub fn modulated_norm(x: Tensor<3>, shift: Tensor<2>, scale: Tensor<2>) -> Tensor<3> {

@@ -26,7 +26,9 @@ pub enum RasterError {
         found: String,
     },
     /// An image is empty, too large, or differs in size from that of the first view.
-    #[error("view {view} is {found:?} pixels (width, height), expected {expected:?} as in view 0, between 1 and {limit}")]
+    #[error(
+        "view {view} is {found:?} pixels (width, height), expected {expected:?} as in view 0, between 1 and {limit}"
+    )]
     ImageSize {
         /// Which view.
         view: usize,

@@ -61,7 +61,7 @@ pub struct Job {
     views: usize,
     width: usize,
     height: usize,
-    cameras: Vec<Camera>,        // [objects * views]
+    cameras: Vec<Camera>,       // [objects * views]
     backgrounds: Vec<[f32; 3]>, // [objects * views]
     config: RasterConfig,
 }

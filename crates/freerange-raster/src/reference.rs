@@ -25,7 +25,8 @@ pub fn render(gaussians: &[f32], camera: &Camera, background: [f32; 3], config: 
     let mut image = Image { rgb: vec![], alpha: vec![], depth: vec![] };
     for_each_pixel(camera, |_, x, y| {
         let (drawn, t) = blend(&splats, x, y);
-        let sum = |value: &dyn Fn(&Splat) -> f64| -> f64 { drawn.iter().map(|d| d.weight * value(&splats[d.splat])).sum() };
+        let sum =
+            |value: &dyn Fn(&Splat) -> f64| -> f64 { drawn.iter().map(|d| d.weight * value(&splats[d.splat])).sum() };
         for c in 0..3 {
             image.rgb.push(sum(&|s| s.color[c].value) + t * f64::from(background[c]));
         }
@@ -68,6 +69,32 @@ pub fn render_backward(
         }
     });
     (d_gaussians, d_background)
+}
+
+/// How many (Gaussian, pixel) pairs have an opacity of at least 1/255, occluded or not: the unit of work in benchmarks.
+pub fn count_pairs(gaussians: &[f32], camera: &Camera, config: &RasterConfig) -> usize {
+    let mut count = 0;
+    for s in project_all(gaussians, camera, config) {
+        let ([a, b, c], [x, y]) = (s.conic.map(|v| v.value), s.mean.map(|v| v.value));
+        let reach = 2.0 * (255.0 * s.opacity.value).ln(); // the largest dx' conic dx
+        if !(reach > 0.0) {
+            continue;
+        }
+        let det = a * c - b * b;
+        let half_height = (reach * a / det).sqrt();
+        let rows =
+            (y - half_height - 0.5).ceil().max(0.0)..(y + half_height + 0.5).min(f64::from(camera.height)).floor();
+        for row in rows.start as i64..rows.end as i64 {
+            let dy = row as f64 + 0.5 - y;
+            // a dx^2 + 2 b dx dy + c dy^2 = reach
+            let half_width = ((b * b - a * c) * dy * dy + a * reach).max(0.0).sqrt() / a;
+            let middle = x - b / a * dy;
+            let first = (middle - half_width - 0.5).ceil().max(0.0);
+            let last = (middle + half_width - 0.5).floor().min(f64::from(camera.width) - 1.0);
+            count += (last - first + 1.0).max(0.0) as usize;
+        }
+    }
+    count
 }
 
 fn for_each_pixel(camera: &Camera, mut f: impl FnMut(usize, f64, f64)) {

@@ -178,11 +178,7 @@ fn views_of(path: &Path) -> Result<Vec<View>, CliError> {
 
 /// What a user without a model would do: fit the Gaussians to the input images.
 fn fit_alone(inputs: &[View], args: &Args) -> Result<Cloud, CliError> {
-    let frame = freerange_camera::canonical_frame(inputs, freerange_camera::Up::Z)?;
-    let canonical: Vec<View> = inputs
-        .iter()
-        .map(|v| View { camera: v.camera.transformed(&frame.canonical_from_user), ..v.clone() })
-        .collect();
+    let (frame, canonical) = pipeline::to_canonical(inputs, args.sampling.up())?;
     let config = FitConfig { seed: args.sampling.seed, ..FitConfig::default() };
     let mut bar = Progress::new("fitting", config.iterations as u64);
     let cloud = fit(&canonical, None, &config, |p| bar.at(p.step as u64, &format!("loss {:.4}", p.loss)))?;

@@ -80,6 +80,15 @@ pub enum UpName {
 }
 
 impl Sampling {
+    /// Which way is up, as the camera crate calls it.
+    pub fn up(&self) -> Up {
+        match self.up {
+            UpName::Z => Up::Z,
+            UpName::Y => Up::Y,
+            UpName::Cameras => Up::Cameras,
+        }
+    }
+
     /// The checkpoint's own way to sample, with what the user overrides.
     pub fn options(&self, checkpoint: &freerange_model::Checkpoint, samples: u32) -> Result<Options, CliError> {
         let mut sample: SampleConfig = match checkpoint.provenance.get("sample") {
@@ -95,11 +104,7 @@ impl Sampling {
             sample,
             seeds: (0..u64::from(samples)).map(|i| self.seed.wrapping_add(i)).collect(),
             refine: self.refine,
-            up: match self.up {
-                UpName::Z => Up::Z,
-                UpName::Y => Up::Y,
-                UpName::Cameras => Up::Cameras,
-            },
+            up: self.up(),
         })
     }
 }
@@ -159,7 +164,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         let suffix = if i == 0 { String::new() } else { format!("-{i}") };
         let file = format!("gaussians{suffix}.ply");
         let user = to_user(&sample.refined, &result.frame.canonical_from_user);
-        write_ply(&output.path(&file)?, &user)?;
+        write_ply(&user, &output.path(&file)?)?;
         write_turntable(&output.path(&format!("turntable{suffix}.gif"))?, &sample.refined, 48, 256)?;
         for (view, picture) in comparisons(&user, &scene.inputs)? {
             output.picture(&format!("inputs{suffix}/{view}.png"), &picture)?;

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use freerange_camera::load_cameras;
-use freerange_splat::read_ply;
+use freerange_splat::{PlyFile, read_ply};
 
 use crate::{
     error::CliError,
@@ -27,7 +27,7 @@ pub struct Args {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
-    let (cloud, notes) = read_ply(&args.file)?;
+    let PlyFile { cloud, notes } = read_ply(&args.file)?;
     for note in notes {
         eprintln!("note: {note}");
     }

@@ -90,8 +90,8 @@ pub fn canonical_from_user(views: &[View], config: &FrameConfig) -> Result<Canon
     };
     let scale = CANONICAL_RADIUS / radius;
     let translation = -scale * (rotation * centre);
-    // Written so that NaN fails.
-    if !(scale > 0.0 && scale.is_finite() && translation.is_finite()) {
+    let sound = scale > 0.0 && scale.is_finite() && translation.is_finite();
+    if !sound {
         return Err(CameraError::Frame(format!("an object of radius {radius} at {centre}")));
     }
     let rounded = |v: f64| (v * 1e4).round() / 1e4;
@@ -143,7 +143,8 @@ fn nearest_point(lines: &[(DVec3, DVec3)]) -> Result<DVec3, CameraError> {
     }
     // The determinant falls with the squared angle between the lines; 1e-4 is about one degree.
     let count = lines.len() as f64;
-    if !(normal.determinant() / count.powi(3) > 1e-4) {
+    let crossing = normal.determinant() / count.powi(3) > 1e-4;
+    if !crossing {
         return Err(CameraError::Frame(
             "all cameras look in the same direction; expected views from different sides".into(),
         ));

@@ -39,8 +39,8 @@ impl Distortion {
                 let ((xr, yr), (xl, yl)) = (self.apply(x + h, y), self.apply(x - h, y));
                 let ((xd, yd), (xu, yu)) = (self.apply(x, y + h), self.apply(x, y - h));
                 let area = ((xr - xl) * (yd - yu) - (xd - xu) * (yr - yl)) / (4.0 * h * h);
-                // Written so that NaN fails.
-                if !(area > 0.05) {
+                let one_to_one = area > 0.05; // false for NaN
+                if !one_to_one {
                     return Err(CameraError::Field {
                         place: place.clone(),
                         field: "k1, k2, k3, k4, p1, p2".into(),
@@ -68,7 +68,7 @@ impl Distortion {
 /// The image at a point in pixels (centres at +0.5); transparent outside, with the border pixels' own half extent kept.
 fn sample(image: &RgbaImage, x: f64, y: f64) -> Rgba<u8> {
     let (w, h) = (f64::from(image.width()), f64::from(image.height()));
-    if !(x >= 0.0 && x <= w && y >= 0.0 && y <= h) {
+    if !((0.0..=w).contains(&x) && (0.0..=h).contains(&y)) {
         return Rgba([0; 4]);
     }
     let (x, y) = ((x - 0.5).clamp(0.0, w - 1.0), (y - 0.5).clamp(0.0, h - 1.0));

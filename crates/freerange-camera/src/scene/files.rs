@@ -45,7 +45,7 @@ fn find(frame: &FrameDescription) -> Result<PathBuf, CameraError> {
 }
 
 fn decoder(path: &Path, frame: &FrameDescription) -> Result<impl ImageDecoder + use<>, CameraError> {
-    let failed = |source| CameraError::Image { place: frame.place.clone(), image: path.to_path_buf(), source };
+    let failed = |e| CameraError::Image { place: frame.place.clone(), image: path.to_path_buf(), source: Box::new(e) };
     let mut limits = image::Limits::default();
     limits.max_image_width = Some(LARGEST_SIDE);
     limits.max_image_height = Some(LARGEST_SIDE);
@@ -62,12 +62,19 @@ pub(super) fn image_size(frame: &FrameDescription) -> Result<(u32, u32), CameraE
     Ok(decoder(&find(frame)?, frame)?.dimensions())
 }
 
+/// An image whose size is not the intrinsics' own: widths and heights.
+struct Rescaled {
+    name: String,
+    from: (u32, u32),
+    to: (u32, u32),
+}
+
 /// Loads images and remembers what there is to tell about them.
 #[derive(Default)]
 pub(super) struct Images {
     pixels: u64,
     cut: Vec<(String, [u8; 3])>,
-    rescaled: Vec<(String, (u32, u32), (u32, u32))>,
+    rescaled: Vec<Rescaled>,
     undistorted: usize,
 }
 
@@ -100,10 +107,10 @@ impl Images {
                 return Err(CameraError::ImageSize { place: place(), image: path, expected, found: (w, h) });
             }
             camera = camera.resized(w, h);
-            self.rescaled.push((frame.name.clone(), expected, (w, h)));
+            self.rescaled.push(Rescaled { name: frame.name.clone(), from: expected, to: (w, h) });
         }
         let mut image = DynamicImage::from_decoder(decoder)
-            .map_err(|source| CameraError::Image { place: place(), image: path.clone(), source })?
+            .map_err(|e| CameraError::Image { place: place(), image: path.clone(), source: Box::new(e) })?
             .into_rgba8();
         let background = |found: String| CameraError::Background { place: place(), image: path.clone(), found };
         let alpha = |image: &RgbaImage, value: u8| image.pixels().all(|p| p[3] == value);
@@ -130,7 +137,7 @@ impl Images {
                 "{count} images have no transparency: their plain background ({name}: rgb {r} {g} {b}) was cut away"
             ));
         }
-        if let Some((name, from, to)) = self.rescaled.first() {
+        if let Some(Rescaled { name, from, to }) = self.rescaled.first() {
             let count = self.rescaled.len();
             notes.push(format!(
                 "{count} images differ in size from `w`, `h` ({name}: {} x {} instead of {} x {}); intrinsics were scaled",

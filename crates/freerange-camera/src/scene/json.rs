@@ -16,7 +16,7 @@ const LARGEST_FILE: u64 = 16 << 20;
 pub(super) const LARGEST_SIDE: u32 = 16384;
 /// Camera models that are a pinhole with at most the distortion that [`Distortion`] describes.
 const PINHOLES: [&str; 6] = ["PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"];
-/// What can be missing from an object's photographs' masks: their meaning differs from program to program.
+/// What a mask file means differs from program to program.
 const MASK_ADVICE: &str = "put the mask into the image's alpha channel";
 
 /// One `transforms*.json`.

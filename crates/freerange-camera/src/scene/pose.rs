@@ -20,7 +20,7 @@ pub fn world_to_camera(rows: &[[f64; 4]], place: &Place) -> Result<DMat4, Camera
     }
     let column = |j: usize| DVec3::new(rows[0][j], rows[1][j], rows[2][j]);
     let (rotation, centre) = (DMat3::from_cols(column(0), column(1), column(2)), column(3));
-    if !(centre.abs().max_element() <= LARGEST_COORDINATE) {
+    if centre.abs().max_element() > LARGEST_COORDINATE {
         return refuse(format!("a camera at {centre}, farther than {LARGEST_COORDINATE} from the origin"));
     }
     let rotation = match nearest_rotation(rotation) {
@@ -43,8 +43,8 @@ fn nearest_rotation(m: DMat3) -> Result<DMat3, String> {
     let gram = m.transpose() * m;
     let largest = |m: DMat3| m.to_cols_array().iter().fold(0.0f64, |a, v| a.max(v.abs()));
     let scale_squared = (gram.x_axis.x + gram.y_axis.y + gram.z_axis.z) / 3.0;
-    // Written so that NaN fails.
-    if !(largest(gram - DMat3::IDENTITY) <= ORTHONORMAL_TOLERANCE) {
+    let orthonormal = largest(gram - DMat3::IDENTITY) <= ORTHONORMAL_TOLERANCE;
+    if !orthonormal {
         if scale_squared < 1e-12 {
             return Err("a zero matrix".into());
         }

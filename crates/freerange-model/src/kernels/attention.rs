@@ -9,7 +9,7 @@ use multiversion::multiversion;
 use rayon::prelude::*;
 
 use super::{
-    contiguous, dims,
+    Shared, contiguous, dims,
     linear::{Matrix, matmul},
     math, tensor, values,
 };
@@ -17,23 +17,6 @@ use crate::ops::EPS;
 
 /// Query rows whose scores exist at once.
 const ROWS: usize = 64;
-
-/// A buffer that several tasks fill in different places.
-#[derive(Clone, Copy)]
-struct Shared(*mut f32);
-// SAFETY: tasks write to disjoint elements only, see each use.
-unsafe impl Send for Shared {}
-// SAFETY: as above.
-unsafe impl Sync for Shared {}
-
-impl Shared {
-    /// # Safety
-    /// `offset` must lie within the buffer.
-    unsafe fn at(self, offset: usize) -> *mut f32 {
-        // SAFETY: the caller's promise.
-        unsafe { self.0.add(offset) }
-    }
-}
 
 /// Sizes of one call.
 #[derive(Clone, Copy)]
@@ -71,14 +54,7 @@ fn normalised(x: &[f32], stride: usize, weight: &[f32], factor: f32, out: &mut [
 /// Backward of [`normalised`]: turns the gradient rows in `grad` into those of `x`, and adds to that of `weight`. With
 /// r = 1 / rms(x) and h = weight grad: dx = r (h - x r^2 mean(h x)).
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma"))]
-fn normalised_backward(
-    x: &[f32],
-    stride: usize,
-    weight: &[f32],
-    factor: f32,
-    grad: &mut [f32],
-    d_weight: &mut [f32],
-) {
+fn normalised_backward(x: &[f32], stride: usize, weight: &[f32], factor: f32, grad: &mut [f32], d_weight: &mut [f32]) {
     let width = weight.len();
     for (i, grad) in grad.chunks_exact_mut(width).enumerate() {
         let x = &x[i * stride..][..width];

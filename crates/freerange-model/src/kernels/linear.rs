@@ -4,7 +4,7 @@ use burn::backend::flex::FlexTensor;
 use gemm::Parallelism;
 use rayon::prelude::*;
 
-use super::{contiguous, dims, math, tensor, values};
+use super::{bf16, contiguous, dims, math, tensor, values};
 
 /// A read-only matrix inside a slice: element (i, j) is `data[i * rows + j * columns]`.
 #[derive(Clone, Copy)]
@@ -25,10 +25,9 @@ impl<'a> Matrix<'a> {
         Self { row_stride: self.column_stride, column_stride: self.row_stride, ..self }
     }
 
-    fn holds(&self, rows: usize, columns: usize) -> bool {
-        rows == 0
-            || columns == 0
-            || (rows - 1) * self.row_stride + (columns - 1) * self.column_stride < self.data.len()
+    /// Whether `[rows, columns]` lie within the slice.
+    pub fn holds(&self, rows: usize, columns: usize) -> bool {
+        rows == 0 || columns == 0 || (rows - 1) * self.row_stride + (columns - 1) * self.column_stride < self.data.len()
     }
 }
 
@@ -78,8 +77,11 @@ fn parallelism(shape: [usize; 3]) -> Parallelism {
     if shape.iter().product::<usize>() < 1 << 22 { Parallelism::None } else { Parallelism::Rayon(0) }
 }
 
-/// A whole product into a new or prepared `[m, n]` buffer.
-fn product(shape: [usize; 3], a: Matrix, b: Matrix, out: &mut [f32], add: bool) {
+/// A whole product into a new or prepared `[m, n]` buffer; in bf16 where asked for and the CPU can.
+pub fn product(shape: [usize; 3], a: Matrix, b: Matrix, out: &mut [f32], add: bool, in_bf16: bool) {
+    if in_bf16 && bf16::available() {
+        return bf16::product(shape, a, b, out, add);
+    }
     assert_eq!(out.len(), shape[0] * shape[2]);
     // SAFETY: `out` is exclusively borrowed and has m rows of n values.
     unsafe { matmul(shape, a, b, 1.0, out.as_mut_ptr(), shape[2], add, parallelism(shape)) }
@@ -88,7 +90,7 @@ fn product(shape: [usize; 3], a: Matrix, b: Matrix, out: &mut [f32], add: bool) 
 /// Rows per piece of work; fixed, so that sums do not depend on the number of threads.
 const ROWS: usize = 64;
 
-pub fn forward(x: FlexTensor, w: FlexTensor, b: FlexTensor) -> FlexTensor {
+pub fn forward(x: FlexTensor, w: FlexTensor, b: FlexTensor, bf16: bool) -> FlexTensor {
     let (x, w, b) = (contiguous(x), contiguous(w), contiguous(b));
     let [outputs, inputs] = dims(&w);
     let mut shape = x.layout().shape().to_vec();
@@ -100,7 +102,7 @@ pub fn forward(x: FlexTensor, w: FlexTensor, b: FlexTensor) -> FlexTensor {
         piece.chunks_exact_mut(outputs).for_each(|row| row.copy_from_slice(bias));
     });
     let weight = Matrix::rows(values(&w), inputs).transposed();
-    product([rows, inputs, outputs], Matrix::rows(values(&x), inputs), weight, &mut out, true);
+    product([rows, inputs, outputs], Matrix::rows(values(&x), inputs), weight, &mut out, true, bf16);
     if let Some(last) = shape.last_mut() {
         *last = outputs;
     }
@@ -112,6 +114,7 @@ pub fn backward(
     w: FlexTensor,
     grad: FlexTensor,
     need_x: bool,
+    bf16: bool,
 ) -> (Option<FlexTensor>, FlexTensor, FlexTensor) {
     let (x, w, grad) = (contiguous(x), contiguous(w), contiguous(grad));
     let [outputs, inputs] = dims(&w);
@@ -119,11 +122,11 @@ pub fn backward(
     let g = Matrix::rows(values(&grad), outputs);
     let dx = need_x.then(|| {
         let mut dx = vec![0f32; rows * inputs];
-        product([rows, outputs, inputs], g, Matrix::rows(values(&w), inputs), &mut dx, false);
+        product([rows, outputs, inputs], g, Matrix::rows(values(&w), inputs), &mut dx, false, bf16);
         tensor(dx, &x.layout().shape().to_vec())
     });
     let mut dw = vec![0f32; outputs * inputs];
-    product([outputs, rows, inputs], g.transposed(), Matrix::rows(values(&x), inputs), &mut dw, false);
+    product([outputs, rows, inputs], g.transposed(), Matrix::rows(values(&x), inputs), &mut dw, false, bf16);
     let db = column_sums(values(&grad), outputs);
     (dx, tensor(dw, &[outputs, inputs]), tensor(db, &[outputs]))
 }
@@ -142,4 +145,3 @@ fn column_sums(data: &[f32], width: usize) -> Vec<f32> {
     partial.iter().for_each(|p| math::add(&mut total, p));
     total
 }
-

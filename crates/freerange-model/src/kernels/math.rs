@@ -115,7 +115,8 @@ mod tests {
             let x = f64::from(i) / 10.0;
             let n = 2_000;
             let h = (x + 10.0) / f64::from(n);
-            let inner: f64 = (1..n).map(|k| if k % 2 == 1 { 4.0 } else { 2.0 } * density(-10.0 + f64::from(k) * h)).sum();
+            let inner: f64 =
+                (1..n).map(|k| if k % 2 == 1 { 4.0 } else { 2.0 } * density(-10.0 + f64::from(k) * h)).sum();
             let truth = (density(-10.0) + density(x) + inner) * h / 3.0;
             let (cdf, pdf) = super::normal(x as f32);
             assert!((f64::from(cdf) - truth).abs() < 3e-7, "{x} {cdf} {truth}");

@@ -6,6 +6,7 @@
 //! partial sums are added in order, so that results are the same on every machine with the same instruction set.
 
 mod attention;
+mod bf16;
 mod linear;
 mod math;
 mod pointwise;
@@ -30,13 +31,19 @@ type Grads<B, const N: usize> = [FloatTensor<B>; N];
 
 /// Forward and backward of each operation on plain tensors. Shapes as in [`crate::ops`].
 pub(crate) trait Kernels: Backend {
-    fn linear_forward(x: FloatTensor<Self>, w: FloatTensor<Self>, b: FloatTensor<Self>) -> FloatTensor<Self>;
+    fn linear_forward(
+        x: FloatTensor<Self>,
+        w: FloatTensor<Self>,
+        b: FloatTensor<Self>,
+        bf16: bool,
+    ) -> FloatTensor<Self>;
     /// Gradients of `x` (where asked for), `w` and `b`.
     fn linear_backward(
         x: FloatTensor<Self>,
         w: FloatTensor<Self>,
         grad: FloatTensor<Self>,
         need_x: bool,
+        bf16: bool,
     ) -> (Option<FloatTensor<Self>>, FloatTensor<Self>, FloatTensor<Self>);
 
     fn modulated_norm_forward(
@@ -81,7 +88,7 @@ pub(crate) trait Kernels: Backend {
 /// The operations as Burn sees them: on the CPU, and differentiable.
 #[backend_extension(Flex, Autodiff)]
 pub(crate) trait FusedOps: Backend {
-    fn linear_bias(x: FloatTensor<Self>, w: FloatTensor<Self>, b: FloatTensor<Self>) -> FloatTensor<Self>;
+    fn linear_bias(x: FloatTensor<Self>, w: FloatTensor<Self>, b: FloatTensor<Self>, bf16: bool) -> FloatTensor<Self>;
     fn modulated_norm(x: FloatTensor<Self>, shift: FloatTensor<Self>, scale: FloatTensor<Self>) -> FloatTensor<Self>;
     fn gated_add(x: FloatTensor<Self>, gate: FloatTensor<Self>, y: FloatTensor<Self>) -> FloatTensor<Self>;
     fn geglu(x: FloatTensor<Self>) -> FloatTensor<Self>;
@@ -95,8 +102,8 @@ pub(crate) trait FusedOps: Backend {
 }
 
 impl FusedOps for Flex {
-    fn linear_bias(x: FlexTensor, w: FlexTensor, b: FlexTensor) -> FlexTensor {
-        Self::linear_forward(x, w, b)
+    fn linear_bias(x: FlexTensor, w: FlexTensor, b: FlexTensor, bf16: bool) -> FlexTensor {
+        Self::linear_forward(x, w, b, bf16)
     }
 
     fn modulated_norm(x: FlexTensor, shift: FlexTensor, scale: FlexTensor) -> FlexTensor {
@@ -134,13 +141,13 @@ struct GegluBackward;
 struct AttentionBackward;
 
 impl<B: Kernels> Backward<B, 3> for LinearBackward {
-    type State = (FloatTensor<B>, FloatTensor<B>);
+    type State = (FloatTensor<B>, FloatTensor<B>, bool);
 
     fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _: &mut Checkpointer) {
         let grad = grads.consume::<B>(&ops.node);
-        let (x, w) = ops.state;
+        let (x, w, bf16) = ops.state;
         let [node_x, node_w, node_b] = ops.parents;
-        let (dx, dw, db) = B::linear_backward(x, w, grad, node_x.is_some());
+        let (dx, dw, db) = B::linear_backward(x, w, grad, node_x.is_some(), bf16);
         for (node, gradient) in [(node_x, dx), (node_w, Some(dw)), (node_b, Some(db))] {
             if let (Some(node), Some(gradient)) = (node, gradient) {
                 grads.register::<B>(node.id, gradient);
@@ -154,8 +161,8 @@ impl<B: Kernels> Backward<B, 3> for ModulatedNormBackward {
 
     fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _: &mut Checkpointer) {
         let grad = grads.consume::<B>(&ops.node);
-        let (x, scale) = ops.state;
-        register::<B, 3>(grads, ops.parents, B::modulated_norm_backward(x, scale, grad));
+        let (x, scale) = ops.state.clone();
+        register::<B, _, 3>(grads, &ops, B::modulated_norm_backward(x, scale, grad));
     }
 }
 
@@ -164,9 +171,9 @@ impl<B: Kernels> Backward<B, 3> for GatedAddBackward {
 
     fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _: &mut Checkpointer) {
         let grad = grads.consume::<B>(&ops.node);
-        let (gate, y) = ops.state;
+        let (gate, y) = ops.state.clone();
         let [dgate, dy] = B::gated_add_backward(gate, y, grad.clone());
-        register::<B, 3>(grads, ops.parents, [grad, dgate, dy]);
+        register::<B, _, 3>(grads, &ops, [grad, dgate, dy]);
     }
 }
 
@@ -175,7 +182,7 @@ impl<B: Kernels> Backward<B, 1> for GegluBackward {
 
     fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
         let grad = grads.consume::<B>(&ops.node);
-        register::<B, 1>(grads, ops.parents, [B::geglu_backward(ops.state, grad)]);
+        register::<B, _, 1>(grads, &ops, [B::geglu_backward(ops.state.clone(), grad)]);
     }
 }
 
@@ -184,18 +191,14 @@ impl<B: Kernels> Backward<B, 3> for AttentionBackward {
 
     fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _: &mut Checkpointer) {
         let grad = grads.consume::<B>(&ops.node);
-        let ([qkv, q_weight, k_weight, out, log_sum], heads) = ops.state;
+        let ([qkv, q_weight, k_weight, out, log_sum], heads) = ops.state.clone();
         let gradients = B::attention_backward(qkv, q_weight, k_weight, out, log_sum, grad, heads);
-        register::<B, 3>(grads, ops.parents, gradients);
+        register::<B, _, 3>(grads, &ops, gradients);
     }
 }
 
-fn register<B: Backend, const N: usize>(
-    grads: &mut Gradients,
-    parents: [Option<burn::backend::autodiff::NodeRef>; N],
-    gradients: Grads<B, N>,
-) {
-    for (node, gradient) in parents.into_iter().zip(gradients) {
+fn register<B: Backend, S, const N: usize>(grads: &mut Gradients, ops: &Ops<S, N>, gradients: Grads<B, N>) {
+    for (node, gradient) in ops.parents.iter().zip(gradients) {
         if let Some(node) = node {
             grads.register::<B>(node.id, gradient);
         }
@@ -203,11 +206,11 @@ fn register<B: Backend, const N: usize>(
 }
 
 impl<B: Kernels, C: CheckpointStrategy> FusedOps for Autodiff<B, C> {
-    fn linear_bias(x: FloatTensor<Self>, w: FloatTensor<Self>, b: FloatTensor<Self>) -> FloatTensor<Self> {
+    fn linear_bias(x: FloatTensor<Self>, w: FloatTensor<Self>, b: FloatTensor<Self>, bf16: bool) -> FloatTensor<Self> {
         let ((x, node_x), (w, node_w), (b, node_b)) = (x.into_parts(), w.into_parts(), b.into_parts());
-        let out = B::linear_forward(x.clone(), w.clone(), b);
+        let out = B::linear_forward(x.clone(), w.clone(), b, bf16);
         match LinearBackward.prepare::<C>([node_x, node_w, node_b]).compute_bound().stateful() {
-            OpsKind::Tracked(prep) => prep.finish((x, w), out),
+            OpsKind::Tracked(prep) => prep.finish((x, w, bf16), out),
             OpsKind::UnTracked(prep) => prep.finish(out),
         }
     }
@@ -255,6 +258,23 @@ impl<B: Kernels, C: CheckpointStrategy> FusedOps for Autodiff<B, C> {
     }
 }
 
+/// A buffer that several tasks fill in different places.
+#[derive(Clone, Copy)]
+struct Shared(*mut f32);
+// SAFETY: tasks write to disjoint elements only, see each use.
+unsafe impl Send for Shared {}
+// SAFETY: as above.
+unsafe impl Sync for Shared {}
+
+impl Shared {
+    /// # Safety
+    /// `offset` must lie within the buffer.
+    unsafe fn at(self, offset: usize) -> *mut f32 {
+        // SAFETY: the caller's promise.
+        unsafe { self.0.add(offset) }
+    }
+}
+
 /// A tensor whose values lie in memory in the order of its axes.
 fn contiguous(t: FlexTensor) -> FlexTensor {
     assert_eq!(t.dtype(), DType::F32, "the CPU computes in f32");
@@ -275,8 +295,8 @@ fn dims<const D: usize>(t: &FlexTensor) -> [usize; D] {
 }
 
 impl Kernels for Flex {
-    fn linear_forward(x: FlexTensor, w: FlexTensor, b: FlexTensor) -> FlexTensor {
-        linear::forward(x, w, b)
+    fn linear_forward(x: FlexTensor, w: FlexTensor, b: FlexTensor, bf16: bool) -> FlexTensor {
+        linear::forward(x, w, b, bf16)
     }
 
     fn linear_backward(
@@ -284,8 +304,9 @@ impl Kernels for Flex {
         w: FlexTensor,
         grad: FlexTensor,
         need_x: bool,
+        bf16: bool,
     ) -> (Option<FlexTensor>, FlexTensor, FlexTensor) {
-        linear::backward(x, w, grad, need_x)
+        linear::backward(x, w, grad, need_x, bf16)
     }
 
     fn modulated_norm_forward(x: FlexTensor, shift: FlexTensor, scale: FlexTensor) -> FlexTensor {

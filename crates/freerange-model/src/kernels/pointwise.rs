@@ -111,14 +111,7 @@ pub fn modulated_norm_backward(x: FlexTensor, scale: FlexTensor, grad: FlexTenso
     let sums = pieces(&mut dx, shape, |batch, row, dx| {
         let (mut d_shift, mut d_scale) = (vec![0f32; d], vec![0f32; d]);
         let part = row * d..row * d + dx.len();
-        norm_rows_backward(
-            &xs[part.clone()],
-            &scales[batch * d..][..d],
-            &grads[part],
-            dx,
-            &mut d_shift,
-            &mut d_scale,
-        );
+        norm_rows_backward(&xs[part.clone()], &scales[batch * d..][..d], &grads[part], dx, &mut d_shift, &mut d_scale);
         (d_shift, d_scale)
     });
     let (d_shift, d_scale) = sums.into_iter().map(|pieces| pieces.into_iter().unzip()).unzip();
@@ -204,9 +197,7 @@ pub fn geglu(x: FlexTensor) -> FlexTensor {
     let f = f2 / 2;
     let xs = values(&x);
     let mut out = vec![0f32; b * t * f];
-    out.par_chunks_mut(ROWS * f)
-        .zip(xs.par_chunks(ROWS * f2))
-        .for_each(|(out, x)| geglu_rows(x, out, f));
+    out.par_chunks_mut(ROWS * f).zip(xs.par_chunks(ROWS * f2)).for_each(|(out, x)| geglu_rows(x, out, f));
     tensor(out, &[b, t, f])
 }
 

@@ -1,5 +1,6 @@
 //! Who touches what: depth order, bands of rows, and for each block of pixels the splats that reach it.
 
+use super::math::{LANES, floor_index, fma, max, min};
 use super::project::Splat;
 
 /// Width and height of a block: the pixels that one vector holds.
@@ -83,6 +84,13 @@ pub struct Chunk {
     list: Vec<u16>,
 }
 
+/// Room for the lists of all blocks while they grow; outlives a call.
+#[derive(Default)]
+pub struct Lists {
+    lengths: Vec<u32>,          // [blocks]
+    entries: Vec<[u16; CHUNK]>, // [blocks]
+}
+
 impl Chunk {
     /// The splats that reach `block`, as positions in the run, from near to far.
     #[inline(always)]
@@ -92,50 +100,81 @@ impl Chunk {
 
     /// Assigns at most [`CHUNK`] `splats` to the blocks of the band that starts at row `top`.
     /// Blocks for which `open` is false get none.
-    pub fn new(first: usize, splats: &[Splat], top: usize, width: usize, open: &[bool]) -> Self {
+    #[inline(always)]
+    pub fn new<const FMA: bool>(
+        first: usize,
+        splats: &[Splat],
+        top: usize,
+        width: usize,
+        open: &[bool],
+        lists: &mut Lists,
+    ) -> Self {
+        assert!(splats.len() <= CHUNK);
         let across = blocks_across(width);
-        let mut offsets = vec![0u32; across * STRIPS + 1];
-        // (splat, first block, last block) of every splat in every strip of blocks
-        let mut runs: Vec<(u16, u16, u16)> = Vec::with_capacity(2 * splats.len());
+        let blocks = across * STRIPS;
+        lists.lengths.clear();
+        lists.lengths.resize(blocks, 0);
+        if lists.entries.len() < blocks {
+            lists.entries.resize(blocks, [0; CHUNK]);
+        }
+        let (lengths, entries) = (&mut lists.lengths[..blocks], &mut lists.entries[..blocks]);
         let last = (width - 1) as f32;
-        for (i, s) in splats.iter().enumerate() {
-            let row0 = usize::from(s.rows[0]).max(top) - top;
-            let row1 = usize::from(s.rows[1]).min(top + BAND - 1) - top;
-            let inverse_height = 1.0 / s.half_height;
-            for strip in row0 / BLOCK[1]..=row1 / BLOCK[1] {
-                let dy = |row: usize| (top + row) as f32 + 0.5 - s.y;
-                let (dy0, dy1) = (dy(row0.max(strip * BLOCK[1])), dy(row1.min(strip * BLOCK[1] + BLOCK[1] - 1)));
-                // Its x extent over these rows: the rightmost point, or the nearest to it that lies in the strip.
-                let edge = |sign: f32| {
-                    let dy = (sign * s.dy_right).max(dy0).min(dy1);
-                    let v = dy * inverse_height;
-                    s.x + s.slope * dy + sign * s.half_width * (1.0 - v * v).max(0.0).sqrt()
-                };
-                let (x0, x1) = ((edge(-1.0) - 0.51).ceil().max(0.0), (edge(1.0) - 0.49).floor().min(last));
-                if x0 > x1 {
-                    continue;
+        for (g, group) in splats.chunks(LANES).enumerate() {
+            let mut s = [[0f32; LANES]; 8];
+            for (l, splat) in group.iter().enumerate() {
+                s[0][l] = splat.x;
+                s[1][l] = splat.y;
+                s[2][l] = splat.slope;
+                s[3][l] = splat.half_width;
+                s[4][l] = splat.half_height;
+                s[5][l] = splat.dy_right;
+                s[6][l] = f32::from(splat.rows[0]) + 0.5;
+                s[7][l] = f32::from(splat.rows[1]) + 0.5;
+            }
+            for strip in 0..STRIPS {
+                let first_row = (top + strip * BLOCK[1]) as f32 + 0.5;
+                let last_row = first_row + (BLOCK[1] - 1) as f32;
+                let mut range = [[0u32; LANES]; 2]; // blocks across, first and one after the last
+                for l in 0..LANES {
+                    let [x, y, slope, half_width, half_height, dy_right, row0, row1] =
+                        [s[0][l], s[1][l], s[2][l], s[3][l], s[4][l], s[5][l], s[6][l], s[7][l]];
+                    let (dy0, dy1) = (max(row0, first_row) - y, min(row1, last_row) - y);
+                    let inverse_height = 1.0 / half_height;
+                    // Its x extent over these rows: the rightmost point, or the nearest to it that lies in the strip.
+                    let edge = |sign: f32| {
+                        let dy = min(max(sign * dy_right, dy0), dy1);
+                        let v = dy * inverse_height;
+                        let half = half_width * max(fma::<FMA>(-v, v, 1.0), 0.0).sqrt();
+                        fma::<FMA>(slope, dy, x) + sign * half
+                    };
+                    // First and last pixel, with a hundredth of a pixel to spare (see `project`).
+                    let (x0, x1) = (edge(-1.0) + 0.49, min(edge(1.0) - 0.49, last));
+                    let reached = (dy0 <= dy1) & (x1 >= 0.0);
+                    range[0][l] = floor_index(min(max(x0, 0.0), last + BLOCK[0] as f32) * (1.0 / BLOCK[0] as f32));
+                    range[1][l] = if reached { floor_index(max(x1, 0.0) * (1.0 / BLOCK[0] as f32)) + 1 } else { 0 };
                 }
-                let (b0, b1) = (x0 as usize / BLOCK[0], x1 as usize / BLOCK[0]);
-                for block in strip * across + b0..=strip * across + b1 {
-                    offsets[block + 1] += u32::from(open[block]);
+                for l in 0..group.len() {
+                    let [b0, b1] = [range[0][l], range[1][l]];
+                    for block in b0..b1 {
+                        let block = strip * across + block as usize;
+                        let length = &mut lengths[block];
+                        entries[block][*length as usize % CHUNK] = (g * LANES + l) as u16;
+                        *length += 1;
+                    }
                 }
-                runs.push((i as u16, (strip * across + b0) as u16, (strip * across + b1) as u16));
             }
         }
+        let mut offsets = Vec::with_capacity(blocks + 1);
         let mut sum = 0;
-        for o in &mut offsets {
-            sum += *o;
-            *o = sum;
+        offsets.push(0);
+        for (length, open) in lengths.iter_mut().zip(open) {
+            *length *= u32::from(*open);
+            sum += *length;
+            offsets.push(sum);
         }
-        let mut next: Vec<u32> = offsets[..offsets.len() - 1].to_vec();
-        let mut list = vec![0u16; sum as usize];
-        for (i, b0, b1) in runs {
-            for block in usize::from(b0)..=usize::from(b1) {
-                if open[block] {
-                    list[next[block] as usize] = i;
-                    next[block] += 1;
-                }
-            }
+        let mut list = Vec::with_capacity(sum as usize);
+        for (length, entries) in lengths.iter().zip(entries) {
+            list.extend_from_slice(&entries[..*length as usize]);
         }
         Self { first, offsets, list }
     }

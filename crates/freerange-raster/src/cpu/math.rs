@@ -75,7 +75,14 @@ pub fn log2<const FMA: bool>(x: f32) -> f32 {
     fma::<FMA>(p, s, e)
 }
 
-/// Precise product-difference-free sum of three products.
+/// `x` rounded down, for `x` in [0, 4e6]; rounded up if it is within a thousandth of the next integer. (A cast would be
+/// exact, but is not vectorised, as it saturates.)
+#[inline(always)]
+pub fn floor_index(x: f32) -> u32 {
+    ((x - 0.499) + ROUND).to_bits() & 0x003f_ffff
+}
+
+/// The scalar product.
 #[inline(always)]
 pub fn dot<const FMA: bool>(a: [f32; 3], b: [f32; 3]) -> f32 {
     fma::<FMA>(a[2], b[2], fma::<FMA>(a[1], b[1], a[0] * b[0]))
@@ -105,6 +112,16 @@ mod tests {
                 assert!((f64::from(v) / truth - 1.0).abs() < 2.5e-7, "e^{x} = {v}");
             }
         });
+    }
+
+    #[test]
+    fn floor_index_rounds_down() {
+        for i in [0u32, 1, 2, 3, 15, 16, 1000, 16383] {
+            for (part, expected) in [(0.0, i), (0.3, i), (0.5, i), (0.99, i), (0.9999, i + 1)] {
+                assert_eq!(floor_index(i as f32 + part), expected, "{i} + {part}");
+            }
+        }
+        assert!(floor_index(4e6).abs_diff(4_000_000) <= 1);
     }
 
     #[test]

@@ -10,12 +10,13 @@ mod project;
 mod tile;
 
 use crate::{CHANNELS, RasterConfig, RasterError};
-use bin::BAND;
+use bin::{BAND, Lists};
 use freerange_camera::Camera;
 use math::LANES;
 use multiversion::{multiversion, target::target_cfg_f};
 use project::{Pinhole, SUMS, Splat};
 use rayon::prelude::*;
+use std::cell::RefCell;
 use tile::{Band, RowGrads, Rows, Scratch};
 
 /// What [`render`] returns. All arrays are row-major.
@@ -44,8 +45,8 @@ pub struct Gradients {
 /// size, in front of one background colour per view.
 ///
 /// Gaussians are culled where any channel is not finite, the quaternion is shorter than 1e-12, the camera z is outside
-/// [`RasterConfig::near`]..=[`RasterConfig::far`], the standard deviation in the image exceeds 10^6 pixels, or the
-/// centre is more than 10^7 pixels away. The result is finite.
+/// [`RasterConfig::near`]..=[`RasterConfig::far`], the standard deviation in the image exceeds 10^6 pixels, the
+/// centre is more than 10^7 pixels away, or a colour channel exceeds 10^6. The result is finite.
 ///
 /// The output also holds what [`render_backward`] needs: about 64 bytes per Gaussian and view, and two bytes per
 /// Gaussian and block of 4 x 4 pixels that it reaches.
@@ -153,7 +154,11 @@ struct ViewState {
 
 /// A slice's part for each view or band; empty slices have empty parts.
 fn parts<'a, T>(all: &'a mut [T], size: usize, count: usize) -> Vec<&'a mut [T]> {
-    if all.is_empty() { (0..count).map(|_| Default::default()).collect() } else { all.chunks_mut(size.max(1)).collect() }
+    if all.is_empty() {
+        (0..count).map(|_| Default::default()).collect()
+    } else {
+        all.chunks_mut(size.max(1)).collect()
+    }
 }
 
 /// Renders `[objects, n, 14]` from `[objects, views]` checked cameras. `stride` floats per pixel go to `color`; if that
@@ -284,8 +289,7 @@ pub(crate) fn backward(
     let per_object = views.len() / objects.max(1);
     out.par_chunks_mut(n.max(1) * CHANNELS).enumerate().for_each(|(object, out)| {
         let range = object * per_object..(object + 1) * per_object;
-        let sources: Vec<_> =
-            range.map(|i| (views[i].camera, pulled[i].0.as_slice())).collect();
+        let sources: Vec<_> = range.map(|i| (views[i].camera, pulled[i].0.as_slice())).collect();
         let rows = &gaussians[object * n * CHANNELS..(object + 1) * n * CHANNELS];
         out.par_chunks_mut(TASK * CHANNELS).enumerate().for_each(|(i, out)| {
             let rows = &rows[i * TASK * CHANNELS..][..out.len()];
@@ -310,17 +314,21 @@ fn project(rows: &[f32], first: u32, camera: &Pinhole, size: [u32; 2], config: &
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl+avx2+fma", "x86_64+avx2+fma"))]
 fn draw(top: usize, splats: Vec<Splat>, background: [f32; 3], rows: &mut Rows) -> Band {
     const FMA: bool = target_cfg_f!(any(target_feature = "fma", target_arch = "aarch64"));
-    if rows.depth.is_empty() {
-        tile::draw::<FMA, false>(top, splats, background, rows)
+    thread_local!(static LISTS: RefCell<Lists> = Default::default());
+    let mut lists = LISTS.take();
+    let band = if rows.depth.is_empty() {
+        tile::draw::<FMA, false>(top, splats, background, &mut lists, rows)
     } else {
-        tile::draw::<FMA, true>(top, splats, background, rows)
-    }
+        tile::draw::<FMA, true>(top, splats, background, &mut lists, rows)
+    };
+    LISTS.set(lists);
+    band
 }
 
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl+avx2+fma", "x86_64+avx2+fma"))]
 fn draw_backward(band: &Band, background: [f32; 3], grads: &RowGrads) -> (Vec<[f32; SUMS]>, [f32; 3]) {
     const FMA: bool = target_cfg_f!(any(target_feature = "fma", target_arch = "aarch64"));
-    thread_local!(static SCRATCH: std::cell::RefCell<Scratch> = Default::default());
+    thread_local!(static SCRATCH: RefCell<Scratch> = Default::default());
     let mut scratch = SCRATCH.take();
     let mut sums = vec![[0f32; SUMS]; band.splats.len()];
     let d_background = if grads.depth.is_empty() {

@@ -2,7 +2,7 @@
 //!
 //! Both work on [`LANES`] Gaussians at a time, every quantity in its own array over lanes.
 
-use super::math::{LANES, dot, exp, fma, log2, max, min};
+use super::math::{LANES, dot, exp, floor_index, fma, log2, max, min};
 use crate::{CHANNELS, RasterConfig};
 use freerange_camera::Camera;
 
@@ -69,6 +69,8 @@ impl Pinhole {
 const MAX_COVARIANCE: f32 = 1e12;
 /// So are those whose mean lies ten million pixels away.
 const MAX_COORDINATE: f32 = 1e7;
+/// And those with a colour beyond a million: their neighbours' gradients would overflow.
+const MAX_COLOR: f32 = 1e6;
 /// log2(255): a splat of this many halvings below full opacity is invisible.
 pub const LOG2_255: f32 = 7.994_353_3;
 
@@ -90,7 +92,6 @@ fn load(rows: &[f32]) -> Lanes<CHANNELS> {
 /// One lane's rotation matrix times scale, and what its derivative needs.
 struct Shape {
     m: [[f32; 3]; 3], // rotation x diag(scale)
-    r: [[f32; 3]; 3],
     s: [f32; 3],
     q: [f32; 4], // unit
     inverse_norm: f32,
@@ -116,18 +117,17 @@ fn shape<const FMA: bool>(c: &Lanes<CHANNELS>, l: usize) -> Shape {
         [r[2][0] * s[0], r[2][1] * s[1], r[2][2] * s[2]],
     ];
     // The reference takes the norm as at least 1e-12; what is shorter, or overflows, has no rotation at all.
-    Shape { m, r, s, q, inverse_norm, ok: (norm2 > 1e-24) & (norm2 < 1e37) }
+    Shape { m, s, q, inverse_norm, ok: (norm2 > 1e-24) & (norm2 < 1e37) }
 }
 
 /// One lane's Gaussian in one camera.
 struct Projected {
     p: [f32; 3], // camera coordinates of the mean
     iz: f32,
-    slope: [f32; 2],      // x/z and y/z, clamped
-    clamped: [bool; 2],   // whether they were
-    t: [[f32; 3]; 2],     // Jacobian of the projection times the camera's rotation
-    b: [[f32; 3]; 2],     // t x m: the covariance in the image is b b' + blur
-    cov: [f32; 3],        // xx, xy, yy with blur
+    clamped: [bool; 2], // whether x/z and y/z were
+    t: [[f32; 3]; 2],   // Jacobian of the projection times the camera's rotation
+    b: [[f32; 3]; 2],   // t x m: the covariance in the image is b b' + blur
+    cov: [f32; 3],      // xx, xy, yy with blur
     inverse_det: f32,
     mean: [f32; 2],
 }
@@ -172,7 +172,6 @@ fn project_lane<const FMA: bool>(mean: [f32; 3], m: &[[f32; 3]; 3], cam: &Pinhol
     Projected {
         p,
         iz,
-        slope,
         clamped: [!(ux >= cam.low[0]) | !(ux <= cam.high[0]), !(uy >= cam.low[1]) | !(uy <= cam.high[1])],
         t,
         b,
@@ -194,7 +193,8 @@ pub fn project<const FMA: bool>(
     out: &mut Vec<Splat>,
 ) {
     let channels = load(rows);
-    let mut o = [[0f32; LANES]; 14];
+    let mut o = [[0f32; LANES]; 13];
+    let mut rows_of = [[0u32; LANES]; 2];
     let mut keep = [0u32; LANES];
     for l in 0..LANES {
         let shape = shape::<FMA>(&channels, l);
@@ -226,8 +226,17 @@ pub fn project<const FMA: bool>(
         o[10][l] = half_extent_x * xy / xx;
         o[11][l] = v.mean[0] - half_extent_x;
         o[12][l] = v.mean[0] + half_extent_x;
+        // Rows of pixel centres, with a hundredth of a pixel to spare, so that rounding cannot lose one: the kernel
+        // tests every pixel anyway.
+        let top = max(v.mean[1] - o[9][l] + 0.49, 0.0);
+        let bottom = min(v.mean[1] + o[9][l] - 0.49, size[1] as f32 - 1.0);
+        rows_of[0][l] = floor_index(min(top, size[1] as f32));
+        rows_of[1][l] = floor_index(max(bottom, 0.0));
         let ok = shape.ok
             & (finite == 0.0)
+            & (channels[11][l].abs() <= MAX_COLOR)
+            & (channels[12][l].abs() <= MAX_COLOR)
+            & (channels[13][l].abs() <= MAX_COLOR)
             & (v.p[2] >= config.near)
             & (v.p[2] <= config.far)
             & (log2_opacity >= -LOG2_255)
@@ -239,19 +248,13 @@ pub fn project<const FMA: bool>(
             & (v.mean[1].abs() <= MAX_COORDINATE)
             & (o[12][l] > 0.0)
             & (o[11][l] < size[0] as f32)
-            & (v.mean[1] + o[9][l] > 0.0)
-            & (v.mean[1] - o[9][l] < size[1] as f32);
+            & (bottom >= 0.0)
+            & (rows_of[0][l] <= rows_of[1][l]);
         keep[l] = u32::from(ok);
     }
     for l in 0..LANES {
         if keep[l] == 0 {
             continue;
-        }
-        // A hundredth of a pixel more, so that rounding cannot lose one; the kernel tests every pixel anyway.
-        let top = (o[1][l] - o[9][l] - 0.51).ceil().max(0.0);
-        let bottom = (o[1][l] + o[9][l] - 0.49).floor().min(size[1] as f32 - 1.0);
-        if top > bottom {
-            continue; // between two rows of pixel centres
         }
         out.push(Splat {
             x: o[0][l],
@@ -266,7 +269,7 @@ pub fn project<const FMA: bool>(
             half_width: o[8][l],
             half_height: o[9][l],
             dy_right: o[10][l],
-            rows: [top as u16, bottom as u16],
+            rows: [rows_of[0][l] as u16, rows_of[1][l] as u16],
             index: first + l as u32,
         });
     }
@@ -367,7 +370,7 @@ pub fn project_backward<const FMA: bool>(
     }
     let mut d = [[0f32; LANES]; CHANNELS];
     for l in 0..LANES {
-        let Shape { m, r: _, s, q: [w, x, y, z], inverse_norm, .. } = shape::<FMA>(&channels, l);
+        let Shape { m, s, q: [w, x, y, z], inverse_norm, .. } = shape::<FMA>(&channels, l);
         // m = r diag(s)
         let mut g = [[0f32; 3]; 3]; // d loss / d r
         for i in 0..3 {

@@ -3,7 +3,7 @@
 //! One vector lane is one pixel of a block. Everything here is inlined into functions that are compiled for several
 //! instruction sets (see `mod.rs`), with loops over lanes that have no branches.
 
-use super::bin::{BAND, BLOCK, CHUNK, Chunk, blocks_across};
+use super::bin::{BAND, BLOCK, CHUNK, Chunk, Lists, blocks_across};
 use super::math::{LANES, exp2, fma, max, min};
 use super::project::{LOG2_255, SUMS, Splat};
 
@@ -85,13 +85,14 @@ pub struct RowGrads<'a> {
     pub depth: &'a [f32],
 }
 
-/// Lanes of the block at (`x0`, `y0`) that lie within the rows: (lane, pixel).
+/// Calls `f(lane, pixel)` for the lanes of the block at (`x0`, `y0`) that lie within the rows.
 #[inline(always)]
-fn inside(x0: usize, y0: usize, width: usize, height: usize) -> impl Iterator<Item = (usize, usize)> {
-    (0..LANES).filter_map(move |l| {
-        let (x, y) = (x0 + l % BLOCK[0], y0 + l / BLOCK[0]);
-        (x < width && y < height).then_some((l, y * width + x))
-    })
+fn each_inside(x0: usize, y0: usize, width: usize, height: usize, mut f: impl FnMut(usize, usize)) {
+    for y in 0..BLOCK[1].min(height - y0) {
+        for x in 0..BLOCK[0].min(width - x0) {
+            f(y * BLOCK[0] + x, (y0 + y) * width + x0 + x);
+        }
+    }
 }
 
 /// Opacity of `s` at each pixel of the block whose corner is at (`x`, `y`), 0 where below 1/255.
@@ -112,6 +113,7 @@ pub fn draw<const FMA: bool, const DEPTH: bool>(
     top: usize,
     splats: Vec<Splat>,
     background: [f32; 3],
+    lists: &mut Lists,
     rows: &mut Rows,
 ) -> Band {
     let across = blocks_across(rows.width);
@@ -119,16 +121,17 @@ pub fn draw<const FMA: bool, const DEPTH: bool>(
     let empty = Block { t: [0.0; LANES], t_final: [1.0; LANES], rgb: [[0.0; LANES]; 3], depth: [0.0; LANES] };
     let mut blocks = vec![empty; count];
     for (i, block) in blocks.iter_mut().enumerate() {
-        for (l, _) in inside(i % across * BLOCK[0], i / across * BLOCK[1], rows.width, rows.height) {
-            block.t[l] = 1.0;
-        }
+        each_inside(i % across * BLOCK[0], i / across * BLOCK[1], rows.width, rows.height, |l, _| block.t[l] = 1.0);
     }
     let mut open = vec![true; across * (BAND / BLOCK[1])];
     let mut chunks = Vec::with_capacity(splats.len().div_ceil(CHUNK));
     for (c, run) in splats.chunks(CHUNK).enumerate() {
-        let chunk = Chunk::new(c * CHUNK, run, top, rows.width, &open);
+        let chunk = Chunk::new::<FMA>(c * CHUNK, run, top, rows.width, &open, lists);
         let mut any_open = false;
-        for (i, block) in blocks.iter_mut().enumerate().filter(|(i, _)| open[*i]) {
+        for (i, block) in blocks.iter_mut().enumerate() {
+            if !open[i] {
+                continue;
+            }
             let (x, y) = ((i % across * BLOCK[0]) as f32, (top + i / across * BLOCK[1]) as f32);
             open[i] = blend::<FMA, DEPTH>(block, run, chunk.of_block(i), x, y);
             any_open |= open[i];
@@ -139,7 +142,7 @@ pub fn draw<const FMA: bool, const DEPTH: bool>(
         }
     }
     for (i, block) in blocks.iter().enumerate() {
-        for (l, pixel) in inside(i % across * BLOCK[0], i / across * BLOCK[1], rows.width, rows.height) {
+        each_inside(i % across * BLOCK[0], i / across * BLOCK[1], rows.width, rows.height, |l, pixel| {
             let t = block.t_final[l];
             for c in 0..3 {
                 rows.color[pixel * rows.stride + c] = fma::<FMA>(t, background[c], block.rgb[c][l]);
@@ -152,20 +155,14 @@ pub fn draw<const FMA: bool, const DEPTH: bool>(
             if DEPTH {
                 rows.depth[pixel] = block.depth[l];
             }
-        }
+        });
     }
     Band { top, splats, chunks }
 }
 
 /// Blends the splats `list` of `run` into the block whose corner is at (`x`, `y`). Whether it can take more.
 #[inline(always)]
-fn blend<const FMA: bool, const DEPTH: bool>(
-    block: &mut Block,
-    run: &[Splat],
-    list: &[u16],
-    x: f32,
-    y: f32,
-) -> bool {
+fn blend<const FMA: bool, const DEPTH: bool>(block: &mut Block, run: &[Splat], list: &[u16], x: f32, y: f32) -> bool {
     let Block { mut t, mut t_final, rgb: [mut red, mut green, mut blue], mut depth } = *block;
     let mut open = true;
     for group in list.chunks(CHECK) {
@@ -225,7 +222,7 @@ pub fn backward<const FMA: bool, const DEPTH: bool>(
         let mut d = [[0f32; LANES]; 4]; // d loss / d (red, green, blue, depth)
         let mut d_transposed = [[0f32; 4]; LANES];
         let mut behind = [0f32; LANES];
-        for (l, pixel) in inside(x0, y0, grads.width, grads.height) {
+        each_inside(x0, y0, grads.width, grads.height, |l, pixel| {
             t[l] = 1.0;
             for c in 0..3 {
                 d[c][l] = grads.color[pixel * grads.stride + c];
@@ -240,7 +237,7 @@ pub fn backward<const FMA: bool, const DEPTH: bool>(
                 d[3][l] = grads.depth[pixel];
             }
             d_transposed[l] = [d[0][l], d[1][l], d[2][l], d[3][l]];
-        }
+        });
 
         let (x, y) = (x0 as f32, (band.top + y0) as f32);
         scratch.splats.clear();

@@ -1,0 +1,244 @@
+//! The real binary on real files, good and broken.
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    process::{Command, Output},
+};
+
+use tempfile::TempDir;
+
+fn freerange(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_freerange")).args(args).output().unwrap()
+}
+
+fn root() -> PathBuf {
+    PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../.."))
+}
+
+fn example() -> PathBuf {
+    root().join("examples/bowl")
+}
+
+/// A copy of the example scene that a test can break.
+fn scene() -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    copy(&example(), folder.path());
+    folder
+}
+
+fn copy(from: &Path, to: &Path) {
+    fs::create_dir_all(to).unwrap();
+    for entry in fs::read_dir(from).unwrap() {
+        let entry = entry.unwrap();
+        let target = to.join(entry.file_name());
+        match entry.file_type().unwrap().is_dir() {
+            true => copy(&entry.path(), &target),
+            false => drop(fs::copy(entry.path(), target).unwrap()),
+        }
+    }
+}
+
+fn edit(scene: &TempDir, change: impl FnOnce(&mut serde_json::Value)) {
+    let path = scene.path().join("transforms_train.json");
+    let mut json = serde_json::from_str(&fs::read_to_string(&path).unwrap()).unwrap();
+    change(&mut json);
+    fs::write(path, serde_json::to_string(&json).unwrap()).unwrap();
+}
+
+/// Reconstructing `scene` must fail with exit code 2, say every one of `words`, and leave no output.
+fn refused(scene: &Path, extra: &[&str], words: &[&str]) {
+    let place = tempfile::tempdir().unwrap();
+    let output = place.path().join("result");
+    let mut args = vec!["reconstruct", scene.to_str().unwrap(), "-o", output.to_str().unwrap(), "--steps", "1"];
+    args.extend(extra);
+    let done = freerange(&args);
+    let message = String::from_utf8_lossy(&done.stderr).into_owned();
+    assert_eq!(done.status.code(), Some(2), "{message}");
+    for word in words {
+        assert!(message.contains(word), "expected {word:?} in: {message}");
+    }
+    assert!(!message.contains("panicked"), "{message}");
+    assert_eq!(fs::read_dir(place.path()).unwrap().count(), 0, "something was left behind");
+}
+
+#[test]
+fn help_and_version() {
+    for args in [&["--help"][..], &["--version"], &["reconstruct", "--help"], &["data", "--help"], &["train", "--help"]] {
+        let done = freerange(args);
+        assert!(done.status.success());
+        assert!(!done.stdout.is_empty());
+    }
+}
+
+#[test]
+fn reconstruct_writes_everything_and_its_cloud_can_be_rendered_from_the_users_cameras() {
+    let place = tempfile::tempdir().unwrap();
+    let output = place.path().join("result");
+    let (scene, out) = (example(), output.to_str().unwrap().to_owned());
+    let args = ["reconstruct", scene.to_str().unwrap(), "-o", &out, "--steps", "3", "--refine", "5", "--json"];
+    let done = freerange(&args);
+    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    let report: serde_json::Value = serde_json::from_slice(&done.stdout).unwrap();
+    for file in ["gaussians.ply", "turntable.gif", "report.json", "inputs"] {
+        assert!(output.join(file).exists(), "{file}");
+    }
+    assert!(report["samples"][0]["further_views"]["psnr"].as_f64().unwrap() > 5.0);
+    assert!(report["samples"][0]["before_refinement"]["input_views"]["psnr"].as_f64().is_some());
+    assert!(report["seconds"].as_array().unwrap().len() >= 4);
+
+    // What was exported, read back and rendered, is what was reported.
+    let cameras = scene.join("transforms_test.json");
+    let renders = place.path().join("renders");
+    let done = freerange(&[
+        "render",
+        output.join("gaussians.ply").to_str().unwrap(),
+        "--cameras",
+        cameras.to_str().unwrap(),
+        "-o",
+        renders.to_str().unwrap(),
+    ]);
+    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    let views = report["samples"][0]["further_views"]["views"].as_array().unwrap().clone();
+    for view in views {
+        let name = view["name"].as_str().unwrap().rsplit('/').next().unwrap().to_owned();
+        let render = image::open(renders.join(format!("{name}.png"))).unwrap().to_rgba8();
+        let folder = scene.join("test");
+        let truth = image::open(folder.join(format!("{name}.png"))).unwrap().to_rgba8();
+        let to_floats = |i: &image::RgbaImage| freerange_camera::composite(i, [1.0; 3]);
+        let psnr = freerange_metrics::psnr(&to_floats(&render), &to_floats(&truth)).unwrap();
+        assert!((psnr - view["psnr"].as_f64().unwrap()).abs() < 0.05, "{name}: {psnr} against {}", view["psnr"]);
+    }
+}
+
+#[test]
+fn the_same_seed_gives_the_same_bytes() {
+    let place = tempfile::tempdir().unwrap();
+    let run = |name: &str, seed: &str| {
+        let output = place.path().join(name);
+        let (scene, out) = (example(), output.to_str().unwrap().to_owned());
+        let done = freerange(&["reconstruct", scene.to_str().unwrap(), "-o", &out, "--steps", "2", "--seed", seed]);
+        assert!(done.status.success());
+        fs::read(output.join("gaussians.ply")).unwrap()
+    };
+    assert_eq!(run("a", "7"), run("b", "7"));
+    assert_ne!(run("a", "7"), run("c", "8"));
+}
+
+#[test]
+fn missing_image() {
+    let s = scene();
+    let first = fs::read_dir(s.path().join("train")).unwrap().next().unwrap().unwrap().path();
+    fs::remove_file(&first).unwrap();
+    refused(s.path(), &[], &["transforms_train.json", first.file_stem().unwrap().to_str().unwrap()]);
+}
+
+#[test]
+fn image_size_differs_from_the_intrinsics() {
+    let s = scene();
+    edit(&s, |json| {
+        json["w"] = 640.into();
+        json["h"] = 480.into();
+    });
+    refused(s.path(), &[], &["640", "512"]);
+}
+
+#[test]
+fn one_view_only() {
+    let s = scene();
+    edit(&s, |json| json["frames"].as_array_mut().unwrap().truncate(1));
+    refused(s.path(), &[], &["transforms_train.json", "1"]);
+}
+
+#[test]
+fn all_cameras_identical() {
+    let s = scene();
+    edit(&s, |json| {
+        let pose = json["frames"][0]["transform_matrix"].clone();
+        json["frames"].as_array_mut().unwrap().iter_mut().for_each(|f| f["transform_matrix"] = pose.clone());
+    });
+    refused(s.path(), &[], &["transforms_train.json"]);
+}
+
+#[test]
+fn a_pose_that_is_no_rigid_transform() {
+    let s = scene();
+    edit(&s, |json| json["frames"][1]["transform_matrix"][0][0] = 3.0.into());
+    refused(s.path(), &[], &["frame 1", "transform_matrix"]);
+}
+
+#[test]
+fn nan_in_the_json() {
+    let s = scene();
+    let path = s.path().join("transforms_train.json");
+    let text = fs::read_to_string(&path).unwrap().replacen("\"camera_angle_x\":", "\"camera_angle_x\": NaN, \"x\":", 1);
+    fs::write(path, text).unwrap();
+    refused(s.path(), &[], &["transforms_train.json"]);
+}
+
+#[test]
+fn truncated_png() {
+    let s = scene();
+    let first = fs::read_dir(s.path().join("train")).unwrap().next().unwrap().unwrap().path();
+    let bytes = fs::read(&first).unwrap();
+    fs::write(&first, &bytes[..bytes.len() / 2]).unwrap();
+    refused(s.path(), &[], &[first.file_name().unwrap().to_str().unwrap()]);
+}
+
+#[test]
+fn truncated_or_foreign_checkpoint() {
+    let s = scene();
+    let place = tempfile::tempdir().unwrap();
+    let shipped = fs::read(root().join("checkpoints/tiny.safetensors")).unwrap();
+    let cut = place.path().join("cut.safetensors");
+    fs::write(&cut, &shipped[..shipped.len() / 2]).unwrap();
+    refused(s.path(), &["--checkpoint", cut.to_str().unwrap()], &["cut.safetensors"]);
+    // A safetensors file that holds something else.
+    let foreign = root().join("tests/golden/dit/pieces.safetensors");
+    refused(s.path(), &["--checkpoint", foreign.to_str().unwrap()], &["pieces.safetensors"]);
+    let missing = place.path().join("nowhere.safetensors");
+    refused(s.path(), &["--checkpoint", missing.to_str().unwrap()], &["nowhere.safetensors"]);
+}
+
+#[test]
+fn a_ply_with_a_lying_element_count() {
+    let place = tempfile::tempdir().unwrap();
+    let file = place.path().join("liar.ply");
+    let properties = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"];
+    let mut text = "ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\n".to_owned();
+    properties.iter().for_each(|p| text += &format!("property float {p}\n"));
+    text += "end_header\n";
+    fs::write(&file, text).unwrap();
+    let output = place.path().join("renders");
+    let cameras = example().join("transforms_test.json");
+    let done = freerange(&[
+        "render",
+        file.to_str().unwrap(),
+        "--cameras",
+        cameras.to_str().unwrap(),
+        "-o",
+        output.to_str().unwrap(),
+    ]);
+    let message = String::from_utf8_lossy(&done.stderr).into_owned();
+    assert_eq!(done.status.code(), Some(2), "{message}");
+    assert!(message.contains("liar.ply"), "{message}");
+    assert!(!output.exists());
+}
+
+#[test]
+fn bad_numbers_on_the_command_line() {
+    let s = scene();
+    refused(s.path(), &["--guidance", "nan"], &["guidance"]);
+    refused(s.path(), &["--photometric=-1"], &["photometric"]);
+    refused(Path::new("no/such/scene"), &[], &["no/such/scene"]);
+}
+
+/// Linux has a device that is always full.
+#[test]
+#[cfg(target_os = "linux")]
+fn a_full_disk() {
+    let done = freerange(&["eval", example().to_str().unwrap(), "--inputs", "transforms_train.json", "--validate", "transforms_test.json", "--method", "white", "--output", "/dev/full/report.json"]);
+    let message = String::from_utf8_lossy(&done.stderr).into_owned();
+    assert_eq!(done.status.code(), Some(2), "{message}");
+    assert!(message.contains("/dev/full"), "{message}");
+}

@@ -1,0 +1,97 @@
+//! The fit from nothing: 3DGS-MCMC.
+
+use crate::{
+    FitConfig, FitError, FitProgress,
+    adam::Adam,
+    init::random_cloud,
+    mcmc::{add_noise, relocate_and_grow},
+    objective::{Objective, check_cloud, normalize_rotations},
+    views::Targets,
+};
+use freerange_camera::View;
+use freerange_splat::Cloud;
+use rand::{SeedableRng, seq::SliceRandom};
+use rand_chacha::ChaCha8Rng;
+use std::ops::ControlFlow;
+
+/// Fits Gaussians to posed views by 3DGS-MCMC (Kheradmand et al. 2024): Adam on the photometric loss, with noise that
+/// lets faint Gaussians explore and relocation of dead ones, which also grows their number.
+///
+/// Starts from `initial`, or, without it, from random Gaussians where all views see the object. `progress` hears of
+/// every step, and ends the fit with what it has by `ControlFlow::Break`. The same input gives the same bytes.
+///
+/// # Errors
+/// If there are no views, or they differ in size from their camera or each other; if the configuration is impossible,
+/// `initial` is empty, not finite or larger than `max_gaussians`; or if the optimisation diverges.
+pub fn fit(
+    views: &[View],
+    initial: Option<&Cloud>,
+    config: &FitConfig,
+    mut progress: impl FnMut(&FitProgress) -> ControlFlow<()>,
+) -> Result<Cloud, FitError> {
+    config.check()?;
+    let targets = Targets::new(views, config.render_size)?;
+    let mut rng = ChaCha8Rng::seed_from_u64(config.seed);
+    let mut cloud = match initial {
+        Some(cloud) => checked(cloud, config.max_gaussians)?,
+        None => random_cloud(&targets, config, &mut rng),
+    };
+    let mut adam = Adam::default();
+    let mut queue = Vec::new();
+    for step in 0..config.iterations {
+        let done = step as f64 / config.iterations as f64;
+        let mean_rate = config.rates.mean * (config.final_mean_rate / config.rates.mean).powf(done);
+
+        let chosen = next_views(&mut queue, views.len(), config.views_per_step, &mut rng);
+        let background = config.background.draw(&mut rng);
+        let mut objective = Objective::photometric(&cloud, &targets, &chosen, background, config.lambda_ssim)?;
+        let loss = objective.loss;
+        objective.add_opacity(&cloud, config.opacity_regularizer);
+        objective.add_scale(&cloud, config.scale_regularizer);
+        objective.check(step)?;
+        adam.step(cloud.rows_mut(), &objective.gradients, &config.rates.by_channel(mean_rate, 1.0));
+        normalize_rotations(&mut cloud);
+
+        let due = step >= config.growth_start && step % config.growth_interval == 0;
+        if due && done < config.growth_stop {
+            relocate_and_grow(&mut cloud, &mut adam, config, &mut rng);
+        }
+        add_noise(&mut cloud, config.noise * mean_rate, config.dead_opacity, &mut rng);
+        check_cloud(&cloud, step)?;
+
+        let now = FitProgress { step: step + 1, steps: config.iterations, loss, gaussians: cloud.len() };
+        if progress(&now).is_break() {
+            break;
+        }
+    }
+    cloud.canonicalize_rotations();
+    Ok(cloud)
+}
+
+/// A cloud to start from.
+pub(crate) fn checked(cloud: &Cloud, most: usize) -> Result<Cloud, FitError> {
+    if cloud.is_empty() {
+        return Err(FitError::EmptyCloud);
+    }
+    cloud.check_finite()?;
+    if cloud.len() > most {
+        let expected = format!("at least the {} Gaussians to start from", cloud.len());
+        return Err(FitError::Config { field: "max_gaussians", expected, found: most.to_string() });
+    }
+    let mut cloud = cloud.clone();
+    cloud.canonicalize_rotations();
+    Ok(cloud)
+}
+
+/// The next views to look at: all of them once in random order, then again.
+fn next_views(queue: &mut Vec<usize>, count: usize, per_step: usize, rng: &mut ChaCha8Rng) -> Vec<usize> {
+    let mut chosen = Vec::new();
+    while chosen.len() < per_step.min(count) {
+        if queue.is_empty() {
+            *queue = (0..count).collect();
+            queue.shuffle(rng);
+        }
+        chosen.extend(queue.pop());
+    }
+    chosen
+}

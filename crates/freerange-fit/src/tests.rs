@@ -1,0 +1,258 @@
+//! Fits of small scenes that the rasteriser itself has drawn, and what all tests share.
+
+use crate::*;
+use freerange_camera::{Camera, View};
+use freerange_raster::{RasterConfig, render};
+use freerange_splat::{Cloud, channel};
+use glam::DVec3;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use safetensors::SafeTensors;
+use std::ops::ControlFlow;
+
+/// A committed reference file.
+pub(crate) struct Golden(Vec<u8>);
+
+pub(crate) fn golden(name: &str) -> Golden {
+    let path = format!("{}/../../tests/golden/{name}.safetensors", env!("CARGO_MANIFEST_DIR"));
+    Golden(std::fs::read(path).unwrap())
+}
+
+impl Golden {
+    fn words(&self, name: &str) -> Vec<[u8; 4]> {
+        let file = SafeTensors::deserialize(&self.0).unwrap();
+        file.tensor(name).unwrap().data().as_chunks().0.to_vec()
+    }
+
+    pub fn floats(&self, name: &str) -> Vec<f32> {
+        self.words(name).into_iter().map(f32::from_le_bytes).collect()
+    }
+
+    pub fn ints(&self, name: &str) -> Vec<i32> {
+        self.words(name).into_iter().map(i32::from_le_bytes).collect()
+    }
+}
+
+/// `n` opaque, coloured Gaussians in a ball of radius 0.4.
+pub(crate) fn ball(n: usize, seed: u64) -> Cloud {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut cloud = Cloud::default();
+    while cloud.len() < n {
+        let mean = DVec3::from_array(std::array::from_fn(|_| rng.random_range(-0.4..0.4)));
+        if mean.length() > 0.4 {
+            continue;
+        }
+        let mut row = [0.0; channel::COUNT];
+        row[channel::MEAN].copy_from_slice(&mean.as_vec3().to_array());
+        row[channel::LOG_SCALE].fill_with(|| rng.random_range(-3.2..-2.2));
+        row[channel::ROTATION].fill_with(|| rng.random_range(-1.0..1.0));
+        row[channel::LOGIT_OPACITY] = rng.random_range(1.0..4.0);
+        row[channel::COLOR].fill_with(|| rng.random_range(0.1..0.9));
+        cloud.push(&row);
+    }
+    cloud
+}
+
+/// Cameras spread over a sphere of radius 1.5 (a Fibonacci spiral).
+pub(crate) fn cameras(count: usize, size: u32, turn: f64) -> Vec<Camera> {
+    (0..count)
+        .map(|i| {
+            let z = 0.8 * (1.0 - (2.0 * i as f64 + 1.0) / count as f64);
+            let angle = turn + 2.399_963 * i as f64;
+            let r = (1.0 - z * z).sqrt();
+            let eye = 1.5 * DVec3::new(r * angle.cos(), r * angle.sin(), z);
+            Camera::look_at(eye, DVec3::ZERO, DVec3::Z, 0.857, size, size)
+        })
+        .collect()
+}
+
+/// The cloud as seen by a camera, with straight alpha.
+fn photograph(cloud: &Cloud, camera: &Camera) -> View {
+    let out = render(cloud.rows(), &[*camera], &[[0.0; 3]], &RasterConfig::default()).unwrap();
+    let mut image = image::RgbaImage::new(camera.width, camera.height);
+    for (i, pixel) in image.pixels_mut().enumerate() {
+        let alpha = out.alpha[i];
+        for c in 0..3 {
+            pixel[c] = (out.rgb[3 * i + c] / alpha.max(1e-6) * 255.0).round() as u8;
+        }
+        pixel[3] = (alpha * 255.0).round() as u8;
+    }
+    View { name: "view".into(), camera: *camera, image }
+}
+
+/// Views of the cloud from all around.
+pub(crate) fn ring(count: usize, size: u32, cloud: &Cloud) -> Vec<View> {
+    cameras(count, size, 0.0).iter().map(|c| photograph(cloud, c)).collect()
+}
+
+/// Mean PSNR in dB of the cloud against views, over white.
+fn psnr(cloud: &Cloud, views: &[View]) -> f64 {
+    let values = views.iter().map(|v| {
+        let out = render(cloud.rows(), &[v.camera], &[[1.0; 3]], &RasterConfig::default()).unwrap();
+        let shown: Vec<f32> = out.rgb.iter().map(|v| v.clamp(0.0, 1.0)).collect();
+        freerange_metrics::psnr(&shown, &freerange_camera::image_ops::composite(&v.image, [1.0; 3])).unwrap()
+    });
+    values.sum::<f64>() / views.len() as f64
+}
+
+fn go(_: &FitProgress) -> ControlFlow<()> {
+    ControlFlow::Continue(())
+}
+
+fn small() -> FitConfig {
+    FitConfig {
+        iterations: 800,
+        max_gaussians: 200,
+        initial: 100,
+        growth_start: 100,
+        growth_interval: 50,
+        growth: 1.1,
+        ..Default::default()
+    }
+}
+
+#[test]
+fn a_fit_shows_unseen_views() {
+    let scene = ball(60, 11);
+    let held_out: Vec<View> = cameras(5, 48, 1.0).iter().map(|c| photograph(&scene, c)).collect();
+    let mut counts = vec![];
+    let fitted = fit(&ring(12, 48, &scene), None, &small(), |p| {
+        counts.push(p.gaussians);
+        ControlFlow::Continue(())
+    })
+    .unwrap();
+    assert_eq!(counts.len(), 800);
+    assert_eq!((counts[0], fitted.len()), (100, 200));
+    let found = psnr(&fitted, &held_out);
+    assert!(found > 25.0, "{found} dB");
+    for row in &fitted {
+        let length: f32 = row[channel::ROTATION].iter().map(|v| v * v).sum();
+        assert!((length - 1.0).abs() < 1e-5);
+    }
+}
+
+#[test]
+fn the_same_seed_gives_the_same_bytes() {
+    let views = ring(4, 24, &ball(30, 4));
+    let config = FitConfig { iterations: 150, views_per_step: 3, ..small() };
+    let run = |seed| fit(&views, None, &FitConfig { seed, ..config.clone() }, go).unwrap();
+    assert_eq!(run(1), run(1));
+    assert_ne!(run(1), run(2));
+    let refined = || refine(&ball(30, 5), &views, &RefineConfig { steps: 20, ..Default::default() }, go).unwrap();
+    assert_eq!(refined(), refined());
+}
+
+#[test]
+fn a_fit_can_start_from_a_cloud_and_stop_early() {
+    let scene = ball(30, 4);
+    let views = ring(4, 24, &scene);
+    let mut steps = 0;
+    let stopped = fit(&views, Some(&scene), &small(), |p| {
+        steps = p.step;
+        if p.step == 3 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    })
+    .unwrap();
+    assert_eq!((steps, stopped.len()), (3, 30));
+    assert!(psnr(&stopped, &views) > 25.0);
+}
+
+/// A cloud as a generator might give it: right on the whole, wrong in detail.
+fn disturbed(cloud: &Cloud, seed: u64) -> Cloud {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut out = cloud.clone();
+    for row in out.iter_mut() {
+        row[channel::MEAN].iter_mut().for_each(|v| *v += rng.random_range(-0.02..0.02));
+        row[channel::LOG_SCALE].iter_mut().for_each(|v| *v += rng.random_range(-0.3..0.3));
+        row[channel::COLOR].iter_mut().for_each(|v| *v += rng.random_range(-0.15..0.15));
+    }
+    out
+}
+
+#[test]
+fn refining_helps_seen_and_unseen_views() {
+    let scene = ball(60, 21);
+    let start = disturbed(&scene, 22);
+    let views = ring(4, 64, &scene);
+    let held_out: Vec<View> = cameras(6, 64, 0.5).iter().map(|c| photograph(&scene, c)).collect();
+    let config = RefineConfig { steps: 150, ..Default::default() };
+    let mut losses = vec![];
+    let refined = refine(&start, &views, &config, |p| {
+        losses.push(p.loss);
+        ControlFlow::Continue(())
+    })
+    .unwrap();
+    assert_eq!(losses.len(), 150);
+    assert!(losses[149] < 0.6 * losses[0], "{} {}", losses[0], losses[149]);
+    assert!(refined.check_finite().is_ok());
+    let (before, after) = (psnr(&start, &held_out), psnr(&refined, &held_out));
+    assert!(after > before + 1.0, "{before} dB, then {after} dB");
+    let limit = config.scale_limit.ln() as f32 + 1e-5;
+    for (row, first) in refined.iter().zip(&start) {
+        assert!(channel::LOG_SCALE.into_iter().all(|c| (row[c] - first[c]).abs() <= limit));
+        let length: f32 = row[channel::ROTATION].iter().map(|v| v * v).sum();
+        assert!((length - 1.0).abs() < 1e-5);
+    }
+}
+
+#[test]
+fn no_steps_and_a_strong_anchor_leave_the_cloud() {
+    let mut cloud = ball(20, 1);
+    cloud.canonicalize_rotations();
+    let views = ring(3, 32, &ball(20, 2));
+    let unchanged = refine(&cloud, &views, &RefineConfig { steps: 0, ..Default::default() }, go).unwrap();
+    assert_eq!(unchanged, cloud);
+    let moved = |anchor| {
+        let config = RefineConfig { steps: 60, anchor, scale_limit: 1.0, ..Default::default() };
+        let refined = refine(&cloud, &views, &config, go).unwrap();
+        assert!(refined.iter().zip(&cloud).all(|(a, b)| a[channel::LOG_SCALE] == b[channel::LOG_SCALE]));
+        refined.rows().iter().zip(cloud.rows()).map(|(a, b)| (a - b).powi(2)).sum::<f32>()
+    };
+    assert!(moved(1000.0) < 0.2 * moved(0.0));
+}
+
+#[test]
+fn bad_input_is_refused() {
+    let (cloud, views) = (ball(5, 1), ring(3, 16, &ball(5, 1)));
+    let fit_message = |views: &[View], cloud: Option<&Cloud>| {
+        fit(views, cloud, &FitConfig { iterations: 1, ..Default::default() }, go).unwrap_err().to_string()
+    };
+    let refine_message =
+        |views: &[View], cloud: &Cloud| refine(cloud, views, &RefineConfig::default(), go).unwrap_err().to_string();
+    let both = |views: &[View], expected: &str| {
+        for message in [fit_message(views, None), refine_message(views, &cloud)] {
+            assert!(message.contains(expected), "{message}");
+        }
+    };
+    both(&[], "no views");
+
+    let change = |change: &dyn Fn(&mut View)| {
+        let mut views = views.clone();
+        change(&mut views[1]);
+        views
+    };
+    both(&change(&|v| *v = ring(1, 20, &cloud).remove(0)), "expected 16 x 16");
+    both(&change(&|v| v.image = image::RgbaImage::new(16, 15)), "the camera's size");
+    both(&change(&|v| v.camera.fx = f64::NAN), "focal");
+    both(&change(&|v| v.camera.fy = 0.0), "focal");
+    both(&change(&|v| v.camera.world_to_camera.w_axis.x = f64::INFINITY), "rigid");
+    both(&change(&|v| v.camera.world_to_camera.x_axis *= 2.0), "rigid");
+
+    let mut broken = cloud.clone();
+    broken.rows_mut()[20] = f32::NAN;
+    for (bad, expected) in [(&broken, "NaN"), (&Cloud::default(), "no Gaussians")] {
+        for message in [fit_message(&views, Some(bad)), refine_message(&views, bad)] {
+            assert!(message.contains(expected), "{message}");
+        }
+    }
+    let large = ball(20, 1);
+    let tight = FitConfig { max_gaussians: 10, initial: 10, ..Default::default() };
+    assert!(fit(&views, Some(&large), &tight, go).unwrap_err().to_string().contains("20 Gaussians"));
+}
+
+#[test]
+fn divergence_is_an_error() {
+    let views = ring(2, 16, &ball(5, 1));
+    let config = FitConfig { iterations: 50, noise: 1e300, ..small() };
+    let message = fit(&views, None, &config, go).unwrap_err().to_string();
+    assert!(message.contains("not finite") && message.starts_with("step"), "{message}");
+}

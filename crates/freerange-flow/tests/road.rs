@@ -1,0 +1,150 @@
+//! The whole road on one object: train, save, load, sample, render. The guard against silent breakage.
+
+use burn::tensor::Device;
+use freerange_camera::{View, composite};
+use freerange_data::{Generated, ObjectSource};
+use freerange_flow::{config::TrainConfig, sample::reconstruct, trainer::Trainer};
+use freerange_metrics::psnr;
+use freerange_model::Checkpoint;
+use freerange_raster::{RasterConfig, render};
+
+/// A model that learns one object in about a minute.
+const ONE_OBJECT: &str = r#"
+seed = 3
+
+[model]
+image_size = 32
+hidden = 64
+blocks = 2
+heads = 2
+registers = 2
+gaussians_per_token = 4
+time_features = 32
+
+[model.encoder]
+kind = "patch"
+patch_size = 8
+channels = 4
+
+[data]
+window = 1
+fresh = 0
+workers = 1
+statistics_objects = 1
+
+[data.object]
+views = 8
+samples_per_axis = 1
+
+[data.object.cameras]
+resolution = 32
+
+[data.object.surface]
+points = 512
+
+[loss]
+held_views = 2
+render_size = 32
+gradient_size = 32
+coupling = "tree"
+
+[optimizer]
+learning_rate = 3e-3
+final_learning_rate = 1e-4
+warmup = 20
+ema = 0.98
+
+[[stage]]
+depth = 6
+image_size = 32
+batch = 8
+steps = STEPS
+
+[sample]
+steps = 20
+guidance = 1.0
+gradient_size = 32
+coupling = "tree"
+"#;
+
+fn config(steps: u64) -> TrainConfig {
+    let config: TrainConfig = toml::from_str(&ONE_OBJECT.replace("STEPS", &steps.to_string())).unwrap();
+    config.validate().unwrap();
+    config
+}
+
+fn train(config: &TrainConfig, folder: &std::path::Path, stop_at: u64) -> Vec<f32> {
+    let mut trainer = Trainer::open(config.clone(), folder, None, &Device::flex(), |_| {}).unwrap();
+    let mut losses = Vec::new();
+    while trainer.step_count() < stop_at {
+        losses.push(trainer.step().unwrap().loss);
+    }
+    trainer.save().unwrap();
+    losses
+}
+
+/// Mean PSNR of renders of `rows` against `views`, on white.
+fn quality(rows: &[f32], views: &[View]) -> f64 {
+    let cameras: Vec<_> = views.iter().map(|v| v.camera).collect();
+    let rgb = render(rows, &cameras, &vec![[1.0; 3]; views.len()], &RasterConfig::default()).unwrap().rgb;
+    let truth: Vec<f32> = views.iter().flat_map(|v| composite(&v.image, [1.0; 3])).collect();
+    psnr(&rgb, &truth).unwrap()
+}
+
+#[test]
+fn one_object_is_learned_sampled_and_rendered() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = config(700);
+    let losses = train(&config, folder.path(), 700);
+    let mean = |x: &[f32]| x.iter().sum::<f32>() / x.len() as f32;
+    assert!(mean(&losses[650..]) < 0.3 * mean(&losses[..20]), "the loss fell from {} to {}", mean(&losses[..20]), mean(&losses[650..]));
+
+    let device = Device::flex();
+    let checkpoint = Checkpoint::load(&folder.path().join("checkpoint.safetensors"), &device).unwrap();
+    let source =
+        Generated { config: config.data.object.clone(), depths: config.depths(), seed: config.seed.wrapping_mul(1 << 32) };
+    let object = source.object(0).unwrap();
+    let (inputs, unseen) = object.views.split_at(4);
+    let clouds = reconstruct(&checkpoint, inputs, &config.sample, &[5, 6], &device, |_| {}).unwrap();
+    assert_eq!(clouds.len(), 2);
+    assert_ne!(clouds[0], clouds[1], "another seed is another sample");
+
+    let target = quality(object.slice(6).unwrap().rows(), unseen);
+    let white = quality(&[], unseen);
+    for cloud in &clouds {
+        assert_eq!(cloud.len(), 64);
+        let found = quality(cloud.rows(), unseen);
+        assert!(
+            found > white + 0.6 * (target - white),
+            "unseen views: {found:.2} dB, a white image {white:.2} dB, the Gaussians that were learned {target:.2} dB"
+        );
+    }
+    let again = reconstruct(&checkpoint, inputs, &config.sample, &[5], &device, |_| {}).unwrap();
+    assert_eq!(again[0].len(), clouds[0].len(), "the same seed on its own");
+}
+
+#[test]
+fn a_resumed_run_continues_as_if_never_stopped() {
+    let (whole, halves) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let config = config(8);
+    let expected = train(&config, whole.path(), 8);
+    let mut found = train(&config, halves.path(), 4);
+    found.extend(train(&config, halves.path(), 8));
+    assert_eq!(found, expected);
+    let bytes = |folder: &tempfile::TempDir| {
+        let device = Device::flex();
+        let checkpoint = Checkpoint::load(&folder.path().join("checkpoint.safetensors"), &device).unwrap();
+        freerange_model::parameters(&checkpoint.model)
+    };
+    assert_eq!(bytes(&whole), bytes(&halves));
+}
+
+#[test]
+fn another_configuration_in_the_same_folder_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    train(&config(2), folder.path(), 1);
+    let mut other = config(2);
+    other.optimizer.learning_rate = 1.0;
+    let e = Trainer::open(other, folder.path(), None, &Device::flex(), |_| {}).err().expect("refused").to_string();
+    assert!(e.contains("another configuration"), "{e}");
+}

@@ -1,0 +1,113 @@
+//! From posed images to image tokens.
+//!
+//! A token is one patch: appearance features, sin-cos position, mean colour, Plücker ray, side by side.
+
+pub(crate) mod bicubic;
+pub(crate) mod dinov2;
+mod patch;
+
+use burn::{
+    module::Module,
+    tensor::{Tensor, TensorData},
+};
+
+pub use dinov2::{Dinov2, WeightsOrigin};
+use patch::PatchMlp;
+
+use crate::{
+    EncoderConfig, ModelConfig, ModelError, PLUCKER,
+    layers::{Builder, Source},
+};
+
+/// Turns posed images into image tokens.
+#[derive(Module, Debug)]
+pub struct ImageEncoder {
+    patch: Option<PatchMlp>,
+    dinov2: Option<Dinov2>,
+    patch_size: usize,
+    channels: usize,
+    position_features: usize,
+}
+
+impl ImageEncoder {
+    pub(crate) fn build<S: Source>(
+        config: &ModelConfig,
+        dinov2: Option<Dinov2>,
+        prefix: &str,
+        builder: &mut Builder<'_, S>,
+    ) -> Result<Self, ModelError> {
+        let patch = match &config.encoder {
+            EncoderConfig::Patch(c) if c.patch_hidden > 0 => Some(PatchMlp::build(c, prefix, builder)?),
+            _ => None,
+        };
+        Ok(Self {
+            patch,
+            dinov2,
+            patch_size: config.encoder.patch_size() as usize,
+            channels: config.encoder.channels(),
+            position_features: config.position_features,
+        })
+    }
+
+    /// The frozen DINOv2, if this encoder has one.
+    pub fn dinov2(&self) -> Option<&Dinov2> {
+        self.dinov2.as_ref()
+    }
+
+    pub(crate) fn replace_dinov2(&mut self, dinov2: Dinov2) {
+        self.dinov2 = Some(dinov2);
+    }
+
+    /// Image tokens.
+    ///
+    /// - `images`: `[b, views, h, w, channels]` in 0..1; `h` and `w` multiples of the patch
+    /// - `plucker`: rays of the patch centres, `[b, views, rows, columns, 6]`
+    ///
+    /// Returns `[b, views * rows * columns, features + position + 3 + 6]`; view by view, row by row.
+    ///
+    /// # Panics
+    /// If shapes do not fit each other or the configuration.
+    pub fn forward(&self, images: Tensor<5>, plucker: Tensor<5>) -> Tensor<3> {
+        let [b, views, h, w, channels] = images.dims();
+        let p = self.patch_size;
+        let (rows, columns) = (h / p, w / p);
+        assert_eq!(channels, self.channels, "channels of the images");
+        assert!(h == rows * p && w == columns * p, "{h} x {w} images are not whole patches of {p}");
+        assert_eq!(plucker.dims(), [b, views, rows, columns, PLUCKER], "one ray per patch");
+        let tokens = views * rows * columns;
+
+        let patches = patch::patches(images.clone(), p) * 2.0 - 1.0; // [b, tokens, p * p * channels]
+        let colour = patches.clone().reshape([b, tokens, p * p, channels]).mean_dim(2).reshape([b, tokens, channels]);
+        let features = match (&self.dinov2, &self.patch) {
+            (Some(dinov2), _) => {
+                let images = images.reshape([b * views, h, w, channels]).permute([0, 3, 1, 2]);
+                let features = dinov2.patch_features(dinov2::imagenet_normalised(images)).detach();
+                features.reshape([b, tokens, dinov2.hidden()])
+            }
+            (None, Some(mlp)) => mlp.forward(patches),
+            (None, None) => patches,
+        };
+        let position = position_embedding(rows, columns, self.position_features);
+        let position = TensorData::new(position, [1, rows * columns, self.position_features]);
+        let position = Tensor::<3>::from_data(position, &features.device()).repeat(&[b, views, 1]);
+        let rays = plucker.reshape([b, tokens, PLUCKER]);
+        Tensor::cat(vec![features, position, colour.narrow(2, 0, 3), rays], 2)
+    }
+}
+
+/// Sin-cos embedding of each patch's row and column (Vaswani et al. 2017, in two dimensions), `[rows * columns,
+/// features]`: sines then cosines of the row, sines then cosines of the column, at a quarter of the features each.
+pub fn position_embedding(rows: usize, columns: usize, features: usize) -> Vec<f32> {
+    let quarter = features / 4;
+    let frequencies: Vec<f64> = (0..quarter).map(|i| 10_000f64.powf(-(i as f64) / quarter as f64)).collect();
+    let mut out = Vec::with_capacity(rows * columns * features);
+    for row in 0..rows {
+        for column in 0..columns {
+            for place in [row as f64, column as f64] {
+                out.extend(frequencies.iter().map(|f| (place * f).sin() as f32));
+                out.extend(frequencies.iter().map(|f| (place * f).cos() as f32));
+            }
+        }
+    }
+    out
+}

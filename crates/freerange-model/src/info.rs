@@ -1,0 +1,376 @@
+//! Sizes and costs of a model, from its configuration alone: nothing is allocated.
+//!
+//! **FLOPs** count a multiplication and an addition as two, in matrix products only: per token of a linear layer
+//! `2 in out`, per head `4 tokens^2 width` for scores and mixing. The last block computes only Gaussian tokens beyond
+//! its keys and values. A training step costs three forward passes (four with recomputation of blocks).
+//!
+//! **Memory of a training step**, 4 bytes a number, `r` rows (= batch x tokens) of width `d`, inner width `f`, `h` heads:
+//! - weights, gradients, Adam's two moments: 4 numbers a trainable parameter, 1 a frozen one;
+//! - what a block keeps for its gradient: the two residual inputs (2 d), two normed inputs (2 d), `qkv` (3 d), mixed
+//!   values (d), attention and feed-forward outputs (2 d), the inner pair and its product (3 f), the softmax
+//!   denominators (h): `r (10 d + 3 f + h)` numbers;
+//! - with recomputation: each block's input, `r d`, and one block's full activations at a time.
+//!
+//! Score matrices are never held (see the attention kernel).
+
+use std::fmt;
+
+use crate::{Dinov2Config, EncoderConfig, FinalLayer, ModelConfig};
+
+/// One tensor of the model.
+#[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
+pub struct TensorInfo {
+    /// As in a checkpoint, such as `dit.gs_in.weight`.
+    pub name: String,
+    /// Linear weights are `[out, in]`.
+    pub shape: Vec<usize>,
+}
+
+impl TensorInfo {
+    /// Number of values.
+    pub fn count(&self) -> u64 {
+        self.shape.iter().map(|&n| n as u64).product()
+    }
+}
+
+/// A named part with its number of parameters.
+#[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
+pub struct PartInfo {
+    /// What it is.
+    pub name: String,
+    /// Its main sizes, in words.
+    pub shape: String,
+    /// Parameters.
+    pub parameters: u64,
+}
+
+/// What one call looks like: the numbers of images, Gaussians and samples at once.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
+pub struct Workload {
+    /// Samples at once.
+    pub batch: usize,
+    /// Input images per sample.
+    pub views: usize,
+    /// Gaussians per sample.
+    pub gaussians: usize,
+}
+
+/// Sizes and costs of a model.
+#[derive(Clone, Debug, PartialEq, serde::Serialize)]
+pub struct ModelInfo {
+    /// Parts and their parameters.
+    pub parts: Vec<PartInfo>,
+    /// Parameters that are trained.
+    pub trainable: u64,
+    /// Parameters of a frozen encoder.
+    pub frozen: u64,
+    /// What the costs below are for.
+    pub workload: Workload,
+    /// Tokens in the transformer.
+    pub tokens: usize,
+    /// FLOPs to encode the images of the whole batch, once per reconstruction.
+    pub encoder_flops: f64,
+    /// FLOPs of one pass of the transformer over the whole batch.
+    pub forward_flops: f64,
+    /// Bytes of weights, gradients and Adam's moments.
+    pub state_bytes: u64,
+    /// Bytes that the blocks keep for the gradient.
+    pub activation_bytes: u64,
+    /// The same where each block is computed again in the backward pass.
+    pub recomputed_activation_bytes: u64,
+}
+
+fn linear(out: &mut Vec<TensorInfo>, name: &str, inputs: usize, outputs: usize) {
+    out.push(TensorInfo { name: format!("{name}.weight"), shape: vec![outputs, inputs] });
+    out.push(TensorInfo { name: format!("{name}.bias"), shape: vec![outputs] });
+}
+
+/// Every trainable tensor of a model, in the order of [`FreeRange::parameters`](crate::FreeRange::parameters).
+pub fn tensors(config: &ModelConfig) -> Vec<TensorInfo> {
+    let (d, f) = (config.hidden, config.ffn_width());
+    let mut out = Vec::new();
+    if let EncoderConfig::Patch(c) = &config.encoder
+        && c.patch_hidden > 0
+    {
+        let pixels = c.channels * (c.patch_size * c.patch_size) as usize;
+        linear(&mut out, "encoder.patch.0", pixels, c.patch_hidden);
+        linear(&mut out, "encoder.patch.2", c.patch_hidden, c.patch_hidden);
+    }
+    out.push(TensorInfo { name: "dit.registers".to_owned(), shape: vec![config.registers, d] });
+    linear(&mut out, "dit.img_in", config.image_token_width(), d);
+    linear(&mut out, "dit.gs_in", config.gaussian_channels(), d);
+    linear(&mut out, "dit.t_mlp.0", config.time_features, d);
+    linear(&mut out, "dit.t_mlp.2", d, d);
+    for i in 0..config.blocks {
+        let name = |part: &str| format!("dit.blocks.{i}.{part}");
+        linear(&mut out, &name("adaln"), d, 6 * d);
+        linear(&mut out, &name("attn.qkv"), d, 3 * d);
+        for part in ["attn.q_norm.weight", "attn.k_norm.weight"] {
+            out.push(TensorInfo { name: name(part), shape: vec![config.head_width()] });
+        }
+        linear(&mut out, &name("attn.out"), d, d);
+        linear(&mut out, &name("ffn.proj_in"), d, 2 * f);
+        linear(&mut out, &name("ffn.proj_out"), f, d);
+    }
+    if config.final_layer == FinalLayer::Adaln {
+        linear(&mut out, "dit.final.adaln", d, 2 * d);
+    }
+    linear(&mut out, "dit.final.linear", d, config.gaussians_per_token * crate::CHANNELS);
+    out
+}
+
+/// Parameters of a DINOv2.
+pub fn dinov2_parameters(config: &Dinov2Config) -> u64 {
+    let (d, f) = (config.hidden as u64, config.ffn_width() as u64);
+    let patch = 3 * u64::from(config.patch_size).pow(2);
+    let embedding = d * (1 + config.registers as u64 + 1 + (config.position_side() as u64).pow(2)) + d * patch + d;
+    let ffn = if config.swiglu { d * 2 * f + 2 * f + f * d + d } else { 2 * d * f + f + d };
+    // Two norms, queries, keys, values and output (our module holds zeros where they have no bias), two scales.
+    let layer = 4 * d + 4 * (d * d + d) + 2 * d + ffn;
+    embedding + config.layers as u64 * layer + 2 * d
+}
+
+impl ModelInfo {
+    /// Computes everything for a valid configuration and a workload.
+    pub fn new(config: &ModelConfig, workload: Workload) -> Self {
+        let tensors = tensors(config);
+        let sum = |prefix: &str| tensors.iter().filter(|t| t.name.starts_with(prefix)).map(TensorInfo::count).sum();
+        let (d, f) = (config.hidden, config.ffn_width());
+        let p = config.gaussians_per_token;
+        let mut parts = Vec::new();
+        let mut part = |name: &str, shape: String, parameters: u64| {
+            parts.push(PartInfo { name: name.to_owned(), shape, parameters });
+        };
+        let frozen = match &config.encoder {
+            EncoderConfig::Dinov2(c) => dinov2_parameters(c),
+            EncoderConfig::Patch(_) => 0,
+        };
+        match &config.encoder {
+            EncoderConfig::Dinov2(c) => part(
+                "encoder: DINOv2 (frozen)",
+                format!("{} layers of width {}, {} heads, patch {}", c.layers, c.hidden, c.heads, c.patch_size),
+                frozen,
+            ),
+            EncoderConfig::Patch(c) => part(
+                "encoder: patch",
+                format!("{0} x {0} pixels x {1} channels to {2}", c.patch_size, c.channels, config.encoder.features()),
+                sum("encoder."),
+            ),
+        }
+        part("registers", format!("{} x {d}", config.registers), sum("dit.registers"));
+        part("image input", format!("{} to {d}", config.image_token_width()), sum("dit.img_in"));
+        part("Gaussian input", format!("{p} Gaussians, {} to {d}", config.gaussian_channels()), sum("dit.gs_in"));
+        part("time", format!("{} to {d} to {d}", config.time_features), sum("dit.t_mlp"));
+        let blocks = config.blocks;
+        part("blocks: modulation", format!("{blocks} x ({d} to 6 x {d})"), count(&tensors, ".adaln.", "dit.blocks"));
+        part(
+            "blocks: attention",
+            format!("{blocks} x ({} heads of {})", config.heads, config.head_width()),
+            count(&tensors, ".attn.", "dit.blocks"),
+        );
+        part("blocks: GEGLU", format!("{blocks} x ({d} to 2 x {f} to {d})"), count(&tensors, ".ffn.", "dit.blocks"));
+        part("output", format!("{d} to {}", p * crate::CHANNELS), sum("dit.final"));
+
+        let trainable: u64 = tensors.iter().map(TensorInfo::count).sum();
+        let tokens = config.tokens(workload.views, workload.gaussians);
+        let rows = (workload.batch * tokens) as u64;
+        let number = size_of::<f32>() as u64;
+        let block = rows * (10 * d + 3 * f + config.heads) as u64 * number;
+        let block_input = rows * d as u64 * number;
+        Self {
+            parts,
+            trainable,
+            frozen,
+            workload,
+            tokens,
+            encoder_flops: encoder_flops(config) * (workload.batch * workload.views) as f64,
+            forward_flops: forward_flops(config, workload) * workload.batch as f64,
+            state_bytes: (4 * trainable + frozen) * number,
+            activation_bytes: blocks as u64 * block,
+            recomputed_activation_bytes: blocks as u64 * block_input + block,
+        }
+    }
+}
+
+fn count(tensors: &[TensorInfo], part: &str, prefix: &str) -> u64 {
+    tensors.iter().filter(|t| t.name.starts_with(prefix) && t.name.contains(part)).map(TensorInfo::count).sum()
+}
+
+/// One sample through the transformer.
+fn forward_flops(config: &ModelConfig, workload: Workload) -> f64 {
+    let [d, f] = [config.hidden, config.ffn_width()].map(|x| x as f64);
+    let tokens = config.tokens(workload.views, workload.gaussians) as f64;
+    let gaussians = (workload.gaussians / config.gaussians_per_token) as f64;
+    let images = (workload.views * config.patches_per_side().pow(2)) as f64;
+    let inputs = images * config.image_token_width() as f64 + gaussians * config.gaussian_channels() as f64;
+    let output = gaussians * (config.gaussians_per_token * crate::CHANNELS) as f64;
+    let time = config.time_features as f64 * d + d * d;
+    let block = |queries: f64| {
+        let modulation = 6.0 * d * d;
+        let qkv = tokens * 3.0 * d * d;
+        let attention = 2.0 * queries * tokens * d + queries * d * d;
+        modulation + qkv + attention + queries * 3.0 * d * f
+    };
+    let blocks = match config.blocks {
+        0 => 0.0,
+        n => (n - 1) as f64 * block(tokens) + block(gaussians),
+    };
+    2.0 * (inputs * d + time + blocks + output * d)
+}
+
+/// One image through the encoder.
+fn encoder_flops(config: &ModelConfig) -> f64 {
+    let patches = config.patches_per_side().pow(2) as f64;
+    match &config.encoder {
+        EncoderConfig::Patch(c) if c.patch_hidden > 0 => {
+            let pixels = c.channels as f64 * f64::from(c.patch_size).powi(2);
+            2.0 * patches * (pixels + c.patch_hidden as f64) * c.patch_hidden as f64
+        }
+        EncoderConfig::Patch(_) => 0.0,
+        EncoderConfig::Dinov2(c) => {
+            let (d, f) = (c.hidden as f64, c.ffn_width() as f64);
+            let tokens = patches + 1.0 + c.registers as f64;
+            let ffn = if c.swiglu { 3.0 } else { 2.0 } * d * f;
+            let layer = tokens * (4.0 * d * d + ffn) + 2.0 * tokens * tokens * d;
+            2.0 * (patches * 3.0 * f64::from(c.patch_size).powi(2) * d + c.layers as f64 * layer)
+        }
+    }
+}
+
+impl fmt::Display for ModelInfo {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
+        for part in &self.parts {
+            writeln!(out, "{:<26} {:<48} {:>14}", part.name, part.shape, grouped(part.parameters))?;
+        }
+        writeln!(out, "{:<75} {:>14}", "trainable parameters", grouped(self.trainable))?;
+        writeln!(out, "{:<75} {:>14}", "frozen parameters", grouped(self.frozen))?;
+        let Workload { batch, views, gaussians } = self.workload;
+        writeln!(out, "\nbatch {batch}, {views} views, {gaussians} Gaussians: {} tokens each", self.tokens)?;
+        writeln!(out, "encoding the images        {:>12.2} GFLOP", self.encoder_flops / 1e9)?;
+        writeln!(out, "one forward pass           {:>12.2} GFLOP", self.forward_flops / 1e9)?;
+        writeln!(
+            out,
+            "one training step          {:>12.2} GFLOP",
+            (self.encoder_flops + 3.0 * self.forward_flops) / 1e9
+        )?;
+        writeln!(out, "weights, gradients, Adam   {:>12.2} GiB", gib(self.state_bytes))?;
+        writeln!(out, "activations                {:>12.2} GiB", gib(self.activation_bytes))?;
+        write!(out, "activations, recomputed    {:>12.2} GiB", gib(self.recomputed_activation_bytes))
+    }
+}
+
+/// Digits in groups of three.
+fn grouped(n: u64) -> String {
+    let digits = n.to_string();
+    let groups: Vec<&str> =
+        digits.as_bytes().rchunks(3).rev().map(|g| std::str::from_utf8(g).unwrap_or_default()).collect();
+    groups.join(",")
+}
+
+#[cfg(test)]
+mod tests {
+    use burn::{module::Module, tensor::Device};
+    use rand::SeedableRng;
+
+    use super::*;
+    use crate::{FreeRange, PatchConfig};
+
+    fn model(config: &ModelConfig) -> FreeRange {
+        FreeRange::new(config, &mut rand_chacha::ChaCha8Rng::seed_from_u64(1), &Device::flex()).unwrap()
+    }
+
+    const LOAD: Workload = Workload { batch: 2, views: 3, gaussians: 64 };
+
+    #[test]
+    fn names_and_shapes_are_the_modules() {
+        for (final_layer, patch_hidden, registers, gradient_channels) in
+            [(FinalLayer::Adaln, 0, 4, true), (FinalLayer::Linear, 5, 0, false)]
+        {
+            let config = ModelConfig {
+                image_size: 8,
+                encoder: EncoderConfig::Patch(PatchConfig { patch_size: 4, channels: 3, patch_hidden }),
+                hidden: 24,
+                blocks: 3,
+                heads: 4,
+                ffn: Some(40),
+                registers,
+                gaussians_per_token: 4,
+                time_features: 6,
+                position_features: 8,
+                final_layer,
+                gradient_channels,
+            };
+            let real: Vec<TensorInfo> =
+                model(&config).parameters().into_iter().map(|p| TensorInfo { name: p.name, shape: p.shape }).collect();
+            assert_eq!(tensors(&config), real);
+            let info = ModelInfo::new(&config, LOAD);
+            assert_eq!(info.trainable, model(&config).num_params() as u64);
+            assert_eq!(info.parts.iter().map(|p| p.parameters).sum::<u64>(), info.trainable);
+        }
+    }
+
+    #[test]
+    fn dinov2_is_counted_as_built() {
+        for (swiglu, registers) in [(false, 0), (true, 4)] {
+            let dinov2 = Dinov2Config {
+                hidden: 24,
+                layers: 2,
+                heads: 3,
+                image_size: 42,
+                swiglu,
+                registers,
+                ..Dinov2Config::default()
+            };
+            let config = ModelConfig {
+                image_size: 28,
+                encoder: EncoderConfig::Dinov2(dinov2.clone()),
+                hidden: 16,
+                blocks: 1,
+                heads: 2,
+                ..ModelConfig::default()
+            };
+            let info = ModelInfo::new(&config, LOAD);
+            assert_eq!(info.frozen, model(&config).encoder().dinov2().unwrap().num_params() as u64);
+            assert_eq!(info.trainable + info.frozen, model(&config).num_params() as u64);
+        }
+    }
+
+    #[test]
+    fn the_paper_has_four_tenths_of_a_billion() {
+        let info = ModelInfo::new(&ModelConfig::default(), Workload { batch: 1, views: 4, gaussians: 8192 });
+        // 18 blocks of 22 d^2: modulation 6, attention 4, GEGLU 12.
+        let estimate = 18.0 * 22.0 * 1024.0 * 1024.0;
+        assert!((info.trainable as f64 / estimate - 1.0).abs() < 0.02, "{}", info.trainable);
+        // DINOv2-Base has 86.6 million, of which one mask token is not used here.
+        assert_eq!(info.frozen, 86_580_480 - 768);
+        assert!(info.recomputed_activation_bytes < info.activation_bytes / 8);
+        let text = info.to_string();
+        assert!(text.contains("18 x (16 heads of 64)") && text.contains("86,579,712"), "{text}");
+    }
+
+    #[test]
+    fn flops_of_a_model_small_enough_to_count_by_hand() {
+        let config = ModelConfig {
+            image_size: 4,
+            encoder: EncoderConfig::Patch(PatchConfig { patch_size: 4, channels: 3, patch_hidden: 0 }),
+            hidden: 2,
+            blocks: 1,
+            heads: 1,
+            ffn: Some(3),
+            registers: 1,
+            gaussians_per_token: 2,
+            time_features: 4,
+            position_features: 0,
+            final_layer: FinalLayer::Linear,
+            gradient_channels: true,
+        };
+        let info = ModelInfo::new(&config, Workload { batch: 1, views: 1, gaussians: 4 });
+        let inputs = 57 * 2 + 2 * 56 * 2;
+        let time = 4 * 2 + 2 * 2;
+        let block = 6 * 4 + 4 * 3 * 4 + (2 * 4 * 2) * 2 + 2 * 4 + 2 * (2 * 6 + 3 * 2);
+        let output = 2 * 2 * 28;
+        assert_eq!(info.tokens, 1 + 1 + 2);
+        assert_eq!(info.forward_flops, f64::from(2 * (inputs + time + block + output)));
+    }
+}

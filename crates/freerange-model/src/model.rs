@@ -1,0 +1,221 @@
+//! The whole network as one module.
+
+use burn::{
+    module::{Module, ModuleMapper, ModuleVisitor, Param},
+    tensor::{Device, Tensor, TensorData},
+};
+use rand::Rng;
+
+use crate::{
+    Dinov2, Dit, EncoderConfig, ImageEncoder, ModelConfig, ModelError,
+    layers::{Builder, RandomSource, Source},
+    ops::Compute,
+};
+
+/// Image encoder and transformer.
+#[derive(Module, Debug)]
+pub struct FreeRange {
+    encoder: ImageEncoder,
+    dit: Dit,
+}
+
+/// One trainable tensor of a model: its PyTorch-like name, its shape, its values.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Parameter {
+    /// For instance `dit.blocks.0.attn.qkv.weight`.
+    pub name: String,
+    /// Linear weights are `[out, in]`.
+    pub shape: Vec<usize>,
+    /// Row-major.
+    pub values: Vec<f32>,
+}
+
+impl FreeRange {
+    /// A model with random weights. It lives on `device` and is trainable if that is an autodiff device. A DINOv2
+    /// encoder is random too (for dry runs) until it is [replaced](Self::with_dinov2) by a published one.
+    ///
+    /// # Errors
+    /// A configuration that does not make sense.
+    pub fn new(config: &ModelConfig, rng: &mut impl Rng, device: &Device) -> Result<Self, ModelError> {
+        config.validate()?;
+        let mut source = RandomSource(rng);
+        let mut builder = Builder { source: &mut source, device };
+        let dinov2 = match &config.encoder {
+            EncoderConfig::Dinov2(c) => Some(Dinov2::build(c, &mut builder)?.freeze()),
+            EncoderConfig::Patch(_) => None,
+        };
+        Self::build(config, dinov2, &mut builder)
+    }
+
+    pub(crate) fn build<S: Source>(
+        config: &ModelConfig,
+        dinov2: Option<Dinov2>,
+        builder: &mut Builder<'_, S>,
+    ) -> Result<Self, ModelError> {
+        Ok(Self {
+            encoder: ImageEncoder::build(config, dinov2, "encoder.", builder)?,
+            dit: Dit::build(config, config.image_token_width(), "dit.", builder)?,
+        })
+    }
+
+    /// The same model with published, frozen DINOv2 weights.
+    ///
+    /// # Errors
+    /// If the model is configured for another encoder.
+    pub fn with_dinov2(mut self, config: &ModelConfig, dinov2: Dinov2) -> Result<Self, ModelError> {
+        check_dinov2(config, &dinov2)?;
+        self.encoder.replace_dinov2(dinov2);
+        Ok(self)
+    }
+
+    /// The same model, with the transformer's linear layers computed this way.
+    pub fn with_compute(mut self, compute: Compute) -> Self {
+        self.dit.set_compute(compute);
+        self
+    }
+
+    /// The image encoder.
+    pub fn encoder(&self) -> &ImageEncoder {
+        &self.encoder
+    }
+
+    /// The transformer.
+    pub fn dit(&self) -> &Dit {
+        &self.dit
+    }
+
+    /// Image tokens: see [`ImageEncoder::forward`]. `[b, views, h, w, channels]`, `[b, views, rows, columns, 6]` to
+    /// `[b, views * rows * columns, width]`. Zeros of that shape stand for "no images".
+    pub fn encode(&self, images: Tensor<5>, plucker: Tensor<5>) -> Tensor<3> {
+        self.encoder.forward(images, plucker)
+    }
+
+    /// The clean Gaussians: see [`Dit::forward`]. `[b, n, 14]`
+    pub fn denoise(
+        &self,
+        noisy: Tensor<3>,
+        gradient: Option<Tensor<3>>,
+        image_tokens: Tensor<3>,
+        t: Tensor<1>,
+    ) -> Tensor<3> {
+        self.dit.forward(noisy, gradient, image_tokens, t)
+    }
+
+    /// Every trainable tensor, in a fixed order.
+    pub fn parameters(&self) -> Vec<Parameter> {
+        let mut visitor = Collector { path: Vec::new(), out: Vec::new() };
+        self.visit(&mut visitor);
+        visitor.out
+    }
+
+    /// The same model with other values, in the order of [`parameters`](Self::parameters).
+    ///
+    /// # Errors
+    /// If the number of tensors or a tensor's number of values differs.
+    pub fn set_parameters(self, values: &[Vec<f32>]) -> Result<Self, ModelError> {
+        let mut mapper = Setter { path: Vec::new(), values: values.iter(), problem: None };
+        let model = self.map(&mut mapper);
+        if let Some(problem) = mapper.problem {
+            return Err(ModelError::Parameters(problem));
+        }
+        match mapper.values.len() {
+            0 => Ok(model),
+            n => Err(ModelError::Parameters(format!("{n} tensors too many"))),
+        }
+    }
+}
+
+/// Refuses DINOv2 weights of another architecture than the configuration names.
+pub(crate) fn check_dinov2(config: &ModelConfig, dinov2: &Dinov2) -> Result<(), ModelError> {
+    match &config.encoder {
+        EncoderConfig::Dinov2(c) if c == dinov2.config() => Ok(()),
+        other => {
+            let expected = format!("the architecture of the given weights, {:?}", dinov2.config());
+            Err(ModelError::config("encoder", expected, format!("{other:?}")))
+        }
+    }
+}
+
+/// PyTorch would call these layers of a `Sequential` by number, and our field cannot be called `final`.
+pub(crate) fn torch_name(path: &[String]) -> String {
+    let mut name = path.join(".");
+    for (ours, torch) in [
+        ("dit.t_mlp.first.", "dit.t_mlp.0."),
+        ("dit.t_mlp.second.", "dit.t_mlp.2."),
+        ("dit.output.", "dit.final."),
+        ("encoder.patch.first.", "encoder.patch.0."),
+        ("encoder.patch.second.", "encoder.patch.2."),
+    ] {
+        if let Some(rest) = name.strip_prefix(ours) {
+            name = format!("{torch}{rest}");
+        }
+    }
+    name
+}
+
+/// Frozen weights are no parameters.
+fn is_frozen(path: &[String]) -> bool {
+    path.starts_with(&["encoder".to_owned(), "dinov2".to_owned()])
+}
+
+struct Collector {
+    path: Vec<String>,
+    out: Vec<Parameter>,
+}
+
+impl ModuleVisitor for Collector {
+    fn enter_module(&mut self, name: &str, _: &str) {
+        self.path.push(name.to_owned());
+    }
+
+    fn exit_module(&mut self, _: &str, _: &str) {
+        self.path.pop();
+    }
+
+    fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+        if is_frozen(&self.path) {
+            return;
+        }
+        let tensor = param.val();
+        let shape = tensor.dims().to_vec();
+        let values = tensor.into_data().convert::<f32>().try_into_vec::<f32>().expect("converted to f32");
+        self.out.push(Parameter { name: torch_name(&self.path), shape, values });
+    }
+}
+
+struct Setter<'a> {
+    path: Vec<String>,
+    values: std::slice::Iter<'a, Vec<f32>>,
+    problem: Option<String>,
+}
+
+impl ModuleMapper for Setter<'_> {
+    fn enter_module(&mut self, name: &str, _: &str) {
+        self.path.push(name.to_owned());
+    }
+
+    fn exit_module(&mut self, _: &str, _: &str) {
+        self.path.pop();
+    }
+
+    fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+        if is_frozen(&self.path) || self.problem.is_some() {
+            return param;
+        }
+        let name = torch_name(&self.path);
+        let shape = param.val().dims();
+        let Some(values) = self.values.next() else {
+            self.problem = Some(format!("no values for `{name}`"));
+            return param;
+        };
+        if values.len() != shape.iter().product::<usize>() {
+            self.problem = Some(format!("`{name}` of shape {shape:?} was given {} values", values.len()));
+            return param;
+        }
+        param.map(|old| {
+            let tracked = old.is_require_grad();
+            let data = TensorData::new(values.clone(), shape);
+            Tensor::from_data(data, &old.device()).set_require_grad(tracked)
+        })
+    }
+}

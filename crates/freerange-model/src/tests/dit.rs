@@ -1,0 +1,257 @@
+use burn::{
+    module::{Module, ModuleVisitor, Param},
+    tensor::{Device, Gradients, Tensor},
+};
+
+use super::{Golden, numbers, path};
+use crate::{
+    Compute, Dit, EncoderConfig, FinalLayer, FreeRange, ModelConfig, PatchConfig, dit::time_embedding, layers::Builder,
+    ops, weights::TensorFile,
+};
+
+fn golden_dit(name: &str, final_layer: FinalLayer, image_channels: usize, device: &Device) -> Dit {
+    let config = ModelConfig {
+        hidden: 32,
+        blocks: 2,
+        heads: 2,
+        ffn: Some(128),
+        registers: 2,
+        gaussians_per_token: 2,
+        time_features: 16,
+        final_layer,
+        ..ModelConfig::default()
+    };
+    let path = path(&format!("dit/{name}.weights.safetensors"));
+    let bytes = std::fs::read(&path).unwrap();
+    let mut source = TensorFile::parse(&path, "golden file", &bytes).unwrap();
+    let dit = Dit::build(&config, image_channels, "", &mut Builder { source: &mut source, device }).unwrap();
+    source.check_all_used().unwrap();
+    dit
+}
+
+/// Holds the gradient of every weight to its golden vector, by name.
+struct GradientCheck<'a> {
+    path: Vec<String>,
+    golden: &'a Golden,
+    gradients: &'a Gradients,
+    checked: usize,
+}
+
+impl ModuleVisitor for GradientCheck<'_> {
+    fn enter_module(&mut self, name: &str, _: &str) {
+        self.path.push(name.to_owned());
+    }
+
+    fn exit_module(&mut self, _: &str, _: &str) {
+        self.path.pop();
+    }
+
+    fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+        let name = format!("dit.{}", self.path.join("."));
+        let parts: Vec<String> = name.split('.').map(str::to_owned).collect();
+        let name = crate::model::torch_name(&parts);
+        let gradient = param.val().grad(self.gradients).unwrap_or_else(|| panic!("{name} has no gradient"));
+        self.golden.check(&format!("grad/w/{}", &name[4..]), gradient, 1e-3);
+        self.checked += 1;
+    }
+}
+
+fn whole(name: &str, final_layer: FinalLayer) {
+    let device = Device::flex().autodiff();
+    let golden = Golden::read(&format!("dit/{name}.safetensors"));
+    let input = |part: &str| golden.tensor::<3>(&format!("in/{part}"), &device).require_grad();
+    let (z, gradient, images) = (input("z"), input("grad_channels"), input("img"));
+    let t = golden.tensor::<1>("in/t", &device).require_grad();
+    let dit = golden_dit(name, final_layer, images.dims()[2], &device);
+
+    golden.check("out/cond", dit.condition(t.clone()), 1e-4);
+    let tokens = dit.tokens(z.clone(), Some(gradient.clone()), images.clone());
+    golden.check("out/tokens_0", tokens.clone(), 1e-4);
+    golden.check("out/tokens_1", dit.first_block(tokens, t.clone()), 1e-4);
+    let unconditional = dit.forward(z.clone(), Some(gradient.clone()), images.zeros_like(), t.clone());
+    golden.check("out/zhat1_img_zeroed", unconditional, 1e-4);
+
+    let out = dit.forward(z.clone(), Some(gradient.clone()), images.clone(), t.clone());
+    golden.check("out/zhat1", out.clone(), 1e-4);
+    let gradients = (out * golden.tensor("loss/w", &device)).sum().backward();
+    golden.check("grad/z", z.grad(&gradients).unwrap(), 1e-3);
+    golden.check("grad/grad_channels", gradient.grad(&gradients).unwrap(), 1e-3);
+    golden.check("grad/img", images.grad(&gradients).unwrap(), 1e-3);
+    golden.check("grad/t", t.grad(&gradients).unwrap(), 1e-3);
+    let mut check = GradientCheck { path: Vec::new(), golden: &golden, gradients: &gradients, checked: 0 };
+    dit.visit(&mut check);
+    assert_eq!(check.checked, golden.names().filter(|name| name.starts_with("grad/w/")).count());
+}
+
+#[test]
+fn matches_the_reference_with_a_modulated_output() {
+    whole("dit_adaln_final", FinalLayer::Adaln);
+}
+
+#[test]
+fn matches_the_reference_with_a_plain_output() {
+    whole("dit_linear_final", FinalLayer::Linear);
+}
+
+#[test]
+fn bf16_stays_near() {
+    let device = Device::flex();
+    let golden = Golden::read("dit/dit_adaln_final.safetensors");
+    let input = |part: &str| golden.tensor::<3>(&format!("in/{part}"), &device);
+    let images = input("img");
+    let mut dit = golden_dit("dit_adaln_final", FinalLayer::Adaln, images.dims()[2], &device);
+    dit.set_compute(Compute::Bf16);
+    let out = dit.forward(input("z"), Some(input("grad_channels")), images, golden.tensor("in/t", &device));
+    golden.check("out/zhat1", out, 2e-2);
+}
+
+#[test]
+fn the_time_embedding_matches() {
+    let device = Device::flex();
+    let golden = Golden::read("dit/pieces.safetensors");
+    for features in [16, 256] {
+        let found = time_embedding(golden.tensor("in/t", &device), features);
+        golden.check(&format!("out/timestep_embedding_{features}"), found, 1e-4);
+    }
+}
+
+/// The pieces, from the fused operations or from their readable twins.
+struct Ops {
+    linear: fn(Tensor<3>, Tensor<2>, Tensor<1>) -> Tensor<3>,
+    norm: fn(Tensor<3>, Tensor<2>, Tensor<2>) -> Tensor<3>,
+    gated: fn(Tensor<3>, Tensor<2>, Tensor<3>) -> Tensor<3>,
+    geglu: fn(Tensor<3>) -> Tensor<3>,
+    attention: fn(Tensor<3>, Tensor<1>, Tensor<1>, usize, usize) -> Tensor<3>,
+}
+
+#[test]
+fn pieces_match_the_reference() {
+    let fused = Ops {
+        linear: |x, w, b| ops::linear(x, w, b, Compute::F32),
+        norm: ops::modulated_norm,
+        gated: ops::gated_add,
+        geglu: ops::geglu,
+        attention: ops::attention,
+    };
+    let readable = Ops {
+        linear: |x, w, b| ops::reference::linear(x, w, b, Compute::F32),
+        norm: ops::reference::modulated_norm,
+        gated: ops::reference::gated_add,
+        geglu: ops::reference::geglu,
+        attention: ops::reference::attention,
+    };
+    pieces(&fused);
+    pieces(&readable);
+}
+
+fn pieces(ops: &Ops) {
+    let device = Device::flex().autodiff();
+    let golden = Golden::read("dit/pieces.safetensors");
+    let x = golden.tensor::<3>("in/x", &device).require_grad();
+    let c = golden.tensor::<2>("in/c", &device).require_grad();
+    let weight = |name: &str| golden.tensor::<2>(&format!("w/{name}"), &device).require_grad();
+    let vector = |name: &str| golden.tensor::<1>(&format!("w/{name}"), &device).require_grad();
+    let backward = |out: Tensor<3>| (out * golden.tensor("loss/w", &device)).sum().backward();
+    let zeros = Tensor::<2>::zeros([2, 24], &device);
+
+    let w = vector("rms_norm.weight");
+    let out = ops::reference::rms_norm(x.clone(), w.clone());
+    golden.check("out/rmsnorm", out.clone(), 1e-4);
+    let gradients = backward(out);
+    golden.check("grad/rmsnorm/x", x.grad(&gradients).unwrap(), 1e-3);
+    golden.check("grad/rmsnorm/weight", w.grad(&gradients).unwrap(), 1e-3);
+
+    let out = (ops.norm)(x.clone(), zeros.clone(), zeros.clone());
+    golden.check("out/layernorm", out.clone(), 1e-4);
+    golden.check("grad/layernorm/x", x.grad(&backward(out)).unwrap(), 1e-3);
+
+    let (w, b) = (weight("m.weight"), vector("m.bias"));
+    let m = (ops.linear)(burn::tensor::activation::silu(c.clone()).unsqueeze_dim(1), w.clone(), b.clone());
+    let m = m.reshape([2, 72]);
+    let part = |i: usize| m.clone().narrow(1, 24 * i, 24);
+    let out = (ops.gated)(x.clone(), part(2), (ops.norm)(x.clone(), part(0), part(1)));
+    golden.check("out/adaln_gated", out.clone(), 1e-4);
+    let gradients = backward(out);
+    golden.check("grad/adaln_gated/x", x.grad(&gradients).unwrap(), 1e-3);
+    golden.check("grad/adaln_gated/c", c.grad(&gradients).unwrap(), 1e-3);
+    golden.check("grad/adaln_gated/m.weight", w.grad(&gradients).unwrap(), 1e-3);
+    golden.check("grad/adaln_gated/m.bias", b.grad(&gradients).unwrap(), 1e-3);
+
+    let names = ["f.proj_in.weight", "f.proj_out.weight", "f.proj_in.bias", "f.proj_out.bias"];
+    let (w, b) = ([weight(names[0]), weight(names[1])], [vector(names[2]), vector(names[3])]);
+    let hidden = (ops.geglu)((ops.linear)(x.clone(), w[0].clone(), b[0].clone()));
+    let out = (ops.linear)(hidden, w[1].clone(), b[1].clone());
+    golden.check("out/geglu", out.clone(), 1e-4);
+    let gradients = backward(out);
+    golden.check("grad/geglu/x", x.grad(&gradients).unwrap(), 1e-3);
+    for i in 0..2 {
+        golden.check(&format!("grad/geglu/{}", names[i]), w[i].grad(&gradients).unwrap(), 1e-3);
+        golden.check(&format!("grad/geglu/{}", names[2 + i]), b[i].grad(&gradients).unwrap(), 1e-3);
+    }
+
+    let names = ["a.qkv.weight", "a.out.weight", "a.qkv.bias", "a.out.bias", "a.q_norm.weight", "a.k_norm.weight"];
+    let w = [weight(names[0]), weight(names[1])];
+    let v = [vector(names[2]), vector(names[3]), vector(names[4]), vector(names[5])];
+    let qkv = (ops.linear)(x.clone(), w[0].clone(), v[0].clone());
+    let out = (ops.attention)(qkv, v[2].clone(), v[3].clone(), 3, 7);
+    let out = (ops.linear)(out, w[1].clone(), v[1].clone());
+    golden.check("out/attention", out.clone(), 1e-4);
+    let gradients = backward(out);
+    golden.check("grad/attention/x", x.grad(&gradients).unwrap(), 1e-3);
+    for i in 0..2 {
+        golden.check(&format!("grad/attention/{}", names[i]), w[i].grad(&gradients).unwrap(), 1e-3);
+    }
+    for i in 0..4 {
+        golden.check(&format!("grad/attention/{}", names[2 + i]), v[i].grad(&gradients).unwrap(), 1e-3);
+    }
+}
+
+fn small(p: usize, gradient_channels: bool) -> ModelConfig {
+    ModelConfig {
+        image_size: 8,
+        encoder: EncoderConfig::Patch(PatchConfig { patch_size: 4, channels: 3, patch_hidden: 0 }),
+        hidden: 16,
+        blocks: 2,
+        heads: 2,
+        registers: 0,
+        gaussians_per_token: p,
+        time_features: 8,
+        gradient_channels,
+        ..ModelConfig::default()
+    }
+}
+
+#[test]
+fn every_token_size_runs_and_starts_at_zero() {
+    let device = Device::flex();
+    for p in [1, 2, 4, 8] {
+        for gradient_channels in [false, true] {
+            let config = small(p, gradient_channels);
+            let mut rng = <rand_chacha::ChaCha8Rng as rand::SeedableRng>::seed_from_u64(3);
+            let model = FreeRange::new(&config, &mut rng, &device).unwrap();
+            let images = Tensor::<5>::ones([2, 3, 8, 8, 3], &device);
+            let tokens = model.encode(images, Tensor::ones([2, 3, 2, 2, 6], &device));
+            assert_eq!(tokens.dims(), [2, 12, config.image_token_width()]);
+            let z = Tensor::<3>::ones([2, 16, 14], &device);
+            let gradient = gradient_channels.then(|| z.clone());
+            let t = Tensor::from_floats([0.1, 0.9], &device);
+            let out = model.denoise(z, gradient, tokens, t);
+            assert_eq!(out.dims(), [2, 16, 14]);
+            assert!(numbers(out).iter().all(|&x| x == 0.0), "adaLN-zero: the first prediction is zero");
+        }
+    }
+}
+
+#[test]
+fn pairs_of_gaussians_may_be_reordered() {
+    let device = Device::flex();
+    let golden = Golden::read("dit/dit_adaln_final.safetensors");
+    let input = |part: &str| golden.tensor::<3>(&format!("in/{part}"), &device);
+    let (z, gradient, images) = (input("z"), input("grad_channels"), input("img"));
+    let dit = golden_dit("dit_adaln_final", FinalLayer::Adaln, images.dims()[2], &device);
+    let turn = |x: Tensor<3>| Tensor::cat(vec![x.clone().narrow(1, 4, 8), x.narrow(1, 0, 4)], 1);
+    let t = golden.tensor::<1>("in/t", &device);
+    let out = dit.forward(z.clone(), Some(gradient.clone()), images.clone(), t.clone());
+    let turned = dit.forward(turn(z), Some(turn(gradient)), images, t);
+    super::assert_close("reordered", &numbers(turned), &numbers(turn(out)), 1e-5);
+}
