@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use freerange_camera::{Camera, composite};
+use freerange_camera::{Camera, image_ops::composite};
 use freerange_raster::{RasterConfig, render};
 use freerange_splat::Cloud;
 use glam::DVec3;

@@ -1,9 +1,9 @@
 //! The main job as one function: posed images in the user's frame in, Gaussians in the user's frame out.
 
-use std::time::Instant;
+use std::{ops::ControlFlow, time::Instant};
 
 use burn::tensor::Device;
-use freerange_camera::{CanonicalFrame, FrameConfig, Similarity, Up, View, canonical_from_user, composite};
+use freerange_camera::{CanonicalFrame, FrameConfig, Similarity, Up, View, canonical_from_user, image_ops::composite};
 use freerange_fit::{RefineConfig, refine};
 use freerange_flow::sample::{SampleConfig, reconstruct};
 use freerange_metrics::{psnr, ssim_3dgs};
@@ -80,7 +80,10 @@ pub fn run(
             steps => {
                 let mut bar = Progress::new("refining", steps as u64);
                 let config = RefineConfig { steps, seed, ..RefineConfig::default() };
-                let refined = refine(&plain, &canonical, &config, |p| bar.at(p.step as u64, &format!("loss {:.4}", p.loss)))?;
+                let refined = refine(&plain, &canonical, &config, |p| {
+                    bar.at(p.step as u64, &format!("loss {:.4}", p.loss));
+                    ControlFlow::Continue(())
+                })?;
                 bar.finish();
                 refined
             }

@@ -12,8 +12,9 @@ use rayon::prelude::*;
 use crate::file::{PARTIAL, io_error};
 use crate::manifest::{Failure, Manifest, ShardRecord, shard_name};
 use crate::quality::slice_psnr;
-use crate::sample::{self, MAX_DEPTH, MAX_VIEWS, Metadata};
+use crate::sample::{self, MAX_DEPTH, Metadata};
 use crate::shard::ShardWriter;
+use crate::validate::check;
 use crate::{DataError, GaussianSource, Object, ObjectConfig};
 
 /// A folder of objects.
@@ -29,7 +30,7 @@ pub struct GenerateConfig {
     /// Depths of the slices to keep, ascending.
     pub depths: Vec<u32>,
     /// Views of every object, the last ones, against which the slices are measured; the PSNR goes into the object's
-    /// metadata. Only for `surface` Gaussians: for them every view is held out. 0 measures nothing.
+    /// metadata. Only for unpolished `surface` Gaussians: for them every view is held out. 0 measures nothing.
     pub quality_views: usize,
     /// Licence of the objects, as an SPDX identifier.
     pub licence: String,
@@ -55,25 +56,21 @@ impl GenerateConfig {
     /// Checks every field.
     ///
     /// # Errors
-    /// [`DataError::Config`].
+    /// As [`ObjectConfig::validate`].
     pub fn validate(&self) -> Result<(), DataError> {
-        let check = |ok: bool, field: &str, expected: &str, found: String| match ok {
-            true => Ok(()),
-            false => Err(DataError::Config { field: field.into(), expected: expected.into(), found }),
-        };
         let count = 1..=1u64 << 32;
-        check(count.contains(&self.objects), "objects", "1 to 2^32", self.objects.to_string())?;
+        check(count.contains(&self.objects), "objects", "1 to 2^32", self.objects)?;
         let per = self.objects_per_shard;
-        check((1..=1 << 20).contains(&per), "objects_per_shard", "1 to 2^20", per.to_string())?;
+        check((1..=1 << 20).contains(&per), "objects_per_shard", "1 to 2^20", per)?;
         let ascending = self.depths.is_sorted_by(|a, b| a < b) && self.depths.iter().all(|d| *d <= MAX_DEPTH);
         let expected = format!("one or more ascending depths up to {MAX_DEPTH}");
-        check(ascending && !self.depths.is_empty(), "depths", &expected, format!("{:?}", self.depths))?;
+        check(ascending && !self.depths.is_empty(), "depths", &expected, &self.depths)?;
+        self.object.validate()?;
         let views = self.object.views;
-        check((1..=MAX_VIEWS).contains(&views), "object.views", &format!("1 to {MAX_VIEWS}"), views.to_string())?;
         let measured = self.quality_views;
-        check(measured <= views, "quality_views", &format!("at most the {views} views"), measured.to_string())?;
-        let held_out = measured == 0 || self.object.gaussians == GaussianSource::Surface;
-        check(held_out, "quality_views", "0 where Gaussians are fitted to all views", measured.to_string())
+        check(measured <= views, "quality_views", &format!("at most the {views} views"), measured)?;
+        let unseen = self.object.gaussians == GaussianSource::Surface && self.object.polish == 0;
+        check(measured == 0 || unseen, "quality_views", "0 where Gaussians are fitted to all views", measured)
     }
 
     /// Number of shards.
@@ -111,7 +108,7 @@ pub struct Summary {
 /// thread are in memory at once.
 ///
 /// # Errors
-/// [`DataError::Config`]; [`DataError::File`] where the folder holds objects of another configuration, or another
+/// As [`GenerateConfig::validate`]; [`DataError::File`] where the folder holds objects of another configuration, or another
 /// process writes to it; [`DataError::Io`]. Single objects that cannot be made are recorded in the manifest; only if
 /// none of the first shard can be made, the first one's error is returned.
 pub fn generate_shards(
@@ -166,9 +163,10 @@ fn lock(folder: &Path) -> Result<File, DataError> {
     let file = File::create(&path).map_err(io_error(&path))?;
     match file.try_lock() {
         Ok(()) => Ok(file),
-        Err(std::fs::TryLockError::WouldBlock) => {
-            Err(DataError::File { path: folder.into(), problem: "another process is making objects in this folder".into() })
-        }
+        Err(std::fs::TryLockError::WouldBlock) => Err(DataError::File {
+            path: folder.into(),
+            problem: "another process is making objects in this folder".into(),
+        }),
         Err(std::fs::TryLockError::Error(source)) => Err(DataError::Io { path, source }),
     }
 }

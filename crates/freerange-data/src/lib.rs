@@ -18,6 +18,7 @@ mod stream;
 mod surface;
 #[cfg(test)]
 mod tests;
+mod validate;
 
 pub use error::DataError;
 pub use generate::{GenerateConfig, Summary, generate_shards};

@@ -95,7 +95,8 @@ impl Manifest {
         struct Version {
             format: u32,
         }
-        let Version { format } = serde_json::from_slice(&text).map_err(|e| problem(format!("no manifest of shards: {e}")))?;
+        let Version { format } =
+            serde_json::from_slice(&text).map_err(|e| problem(format!("no manifest of shards: {e}")))?;
         if format != FORMAT {
             return Err(problem(format!("field format: expected {FORMAT}, found {format}")));
         }

@@ -68,6 +68,7 @@ pub fn measure_quality(
             found: format!("seeds {seeds:?}, depths {depths:?}, {held_out} views"),
         });
     }
+    config.validate()?;
     let objects = seeds.end - seeds.start;
     sources
         .iter()
@@ -189,16 +190,17 @@ mod tests {
     fn finer_slices_are_better_and_both_ways_work() {
         let mut config = tiny_config();
         config.surface.points = 512;
+        config.cameras.resolution = 64;
         config.fit.iterations = 20;
         config.fit.initial = 200;
         config.fit.max_gaussians = 512;
         let sources = [GaussianSource::Surface, GaussianSource::Fit];
         let mut heard = 0;
-        let found = measure_quality(&config, &sources, 0..2, &[2, 9], 2, |_, _| heard += 1).unwrap();
+        let found = measure_quality(&config, &sources, 0..2, &[1, 8], 2, |_, _| heard += 1).unwrap();
         assert_eq!((found.len(), heard), (2, 4));
         for q in &found {
-            assert!(q.psnr[&9] > q.psnr[&2] + 1.0, "{q:?}");
-            assert!(q.worst[&9] <= q.psnr[&9]);
+            assert!(q.psnr[&8] > q.psnr[&1] + 1.0, "{q:?}");
+            assert!(q.worst[&8] <= q.psnr[&8]);
             assert!(q.seconds.scene > 0.0 && q.seconds.views > 0.0 && q.seconds.gaussians > 0.0);
         }
         assert!(measure_quality(&config, &sources, 0..0, &[2], 2, |_, _| {}).is_err());

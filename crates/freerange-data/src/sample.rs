@@ -122,7 +122,8 @@ pub(crate) fn encode(object: &Object, metadata: &Metadata, shard: &Path) -> Resu
     if !is_key(&object.id) || metadata.id != object.id {
         return Err(place.error("an id of 1 to 64 characters A-Z a-z 0-9 - _", format!("{:?}", metadata.id)));
     }
-    let json = |entry, value: serde_json::Result<Vec<u8>>| value.map_err(|e| place.of(entry).error("values JSON can hold", e));
+    let json =
+        |entry, value: serde_json::Result<Vec<u8>>| value.map_err(|e| place.of(entry).error("values JSON can hold", e));
 
     let cameras: Vec<Camera> = object.views.iter().map(|v| v.camera).collect();
     check_cameras(&cameras, place.of(CAMERAS))?;
@@ -142,10 +143,14 @@ pub(crate) fn encode(object: &Object, metadata: &Metadata, shard: &Path) -> Resu
         let size = (view.camera.width, view.camera.height);
         if view.image.dimensions() != size {
             let (w, h) = view.image.dimensions();
-            return Err(place.of(&name).error(format!("the camera's {} x {} pixels", size.0, size.1), format!("{w} x {h}")));
+            return Err(place
+                .of(&name)
+                .error(format!("the camera's {} x {} pixels", size.0, size.1), format!("{w} x {h}")));
         }
         let mut png = Cursor::new(Vec::new());
-        view.image.write_to(&mut png, ImageFormat::Png).map_err(|e| place.of(&name).error("an image PNG can hold", e))?;
+        view.image
+            .write_to(&mut png, ImageFormat::Png)
+            .map_err(|e| place.of(&name).error("an image PNG can hold", e))?;
         entries.push((name, png.into_inner()));
     }
     Ok(entries)
@@ -214,7 +219,9 @@ fn check_cameras(cameras: &[Camera], place: Place) -> Result<(), DataError> {
         }
         let intrinsics = [c.fx, c.fy, c.cx, c.cy];
         if !intrinsics.iter().all(|v| v.is_finite()) || c.fx <= 0.0 || c.fy <= 0.0 {
-            return Err(place.error("finite intrinsics with positive focal lengths", format!("{intrinsics:?} in view {i}")));
+            return Err(
+                place.error("finite intrinsics with positive focal lengths", format!("{intrinsics:?} in view {i}"))
+            );
         }
         let r = DMat3::from_mat4(c.world_to_camera);
         let rigid = (r * r.transpose()).abs_diff_eq(DMat3::IDENTITY, 1e-4)

@@ -8,7 +8,7 @@ use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use crate::file::{NewFile, io_error};
-use crate::sample::{self, CAMERAS, GAUSSIANS, METADATA, MAX_VIEWS, Metadata, Place};
+use crate::sample::{self, CAMERAS, GAUSSIANS, MAX_VIEWS, METADATA, Metadata, Place};
 use crate::{DataError, Object};
 
 /// Largest entry, in bytes: bounds what a reader allocates.
@@ -116,9 +116,13 @@ impl ShardReader {
         for entry in archive.entries_with_seek().map_err(io_error(path))?.raw(true) {
             let entry = entry.map_err(|e| problem(format!("not a tar file from byte {end}: {e}")))?;
             let bytes = entry.path_bytes();
-            let name = std::str::from_utf8(&bytes).ok().and_then(|n| n.split_once('.')).filter(|(k, _)| sample::is_key(k));
+            let name =
+                std::str::from_utf8(&bytes).ok().and_then(|n| n.split_once('.')).filter(|(k, _)| sample::is_key(k));
             let Some((key, rest)) = name else {
-                return Err(problem(format!("expected entries called KEY.*, found {:?}", String::from_utf8_lossy(&bytes))));
+                return Err(problem(format!(
+                    "expected entries called KEY.*, found {:?}",
+                    String::from_utf8_lossy(&bytes)
+                )));
             };
             let place = Place { shard: path, sample: key, entry: rest };
             if !entry.header().entry_type().is_file() {
@@ -211,7 +215,9 @@ impl ShardReader {
     /// The bytes of an entry, whose size the index has checked against the file's.
     fn bytes(&self, file: &mut File, span: Span) -> Result<Vec<u8>, DataError> {
         let mut bytes = vec![0; span.size as usize];
-        file.seek(SeekFrom::Start(span.offset)).and_then(|_| file.read_exact(&mut bytes)).map_err(io_error(&self.path))?;
+        file.seek(SeekFrom::Start(span.offset))
+            .and_then(|_| file.read_exact(&mut bytes))
+            .map_err(io_error(&self.path))?;
         Ok(bytes)
     }
 }

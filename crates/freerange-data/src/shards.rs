@@ -45,8 +45,11 @@ impl Shards {
             return Err(problem("expected objects, found none".into()));
         }
         let shards = open_all(&manifest, folder)?;
-        let mut order: Vec<(u32, u32)> =
-            shards.iter().enumerate().flat_map(|(s, shard)| (0..shard.len()).map(move |i| (s as u32, i as u32))).collect();
+        let mut order: Vec<(u32, u32)> = shards
+            .iter()
+            .enumerate()
+            .flat_map(|(s, shard)| (0..shard.len()).map(move |i| (s as u32, i as u32)))
+            .collect();
         order.shuffle(&mut ChaCha8Rng::seed_from_u64(manifest.config.seed));
         Ok(Self { shards, order, depths: depths.to_vec(), manifest })
     }

@@ -1,7 +1,7 @@
 //! The whole road on one object: train, save, load, sample, render. The guard against silent breakage.
 
 use burn::tensor::Device;
-use freerange_camera::{View, composite};
+use freerange_camera::{View, image_ops::composite};
 use freerange_data::{Generated, ObjectSource};
 use freerange_flow::{config::TrainConfig, sample::reconstruct, trainer::Trainer};
 use freerange_metrics::psnr;
@@ -134,7 +134,7 @@ fn a_resumed_run_continues_as_if_never_stopped() {
     let bytes = |folder: &tempfile::TempDir| {
         let device = Device::flex();
         let checkpoint = Checkpoint::load(&folder.path().join("checkpoint.safetensors"), &device).unwrap();
-        freerange_model::parameters(&checkpoint.model)
+        checkpoint.model.parameters()
     };
     assert_eq!(bytes(&whole), bytes(&halves));
 }

@@ -131,11 +131,22 @@ impl Checkpoint {
         Self::load_with(path, Some(dinov2), device)
     }
 
+    /// Reads a checkpoint that is in memory already. `name` stands for the file in messages.
+    ///
+    /// # Errors
+    /// As [`load`](Self::load).
+    pub fn from_bytes(bytes: &[u8], name: &str, device: &Device) -> Result<Self, ModelError> {
+        Self::parse(Path::new(name), bytes, None, device)
+    }
+
     fn load_with(path: &Path, dinov2: Option<Dinov2>, device: &Device) -> Result<Self, ModelError> {
-        let bytes = read_bounded(path)?;
-        let header = Header::read(path, &bytes)?;
+        Self::parse(path, &read_bounded(path)?, dinov2, device)
+    }
+
+    fn parse(path: &Path, bytes: &[u8], dinov2: Option<Dinov2>, device: &Device) -> Result<Self, ModelError> {
+        let header = Header::read(path, bytes)?;
         header.check_encoder(path, dinov2.as_ref())?;
-        let mut file = TensorFile::parse(path, KIND, &bytes)?;
+        let mut file = TensorFile::parse(path, KIND, bytes)?;
         let model = FreeRange::build(&header.config, dinov2, &mut Builder { source: &mut file, device })?;
         file.check_all_used()?;
         let Header { config, normalization, gradient_rms, depth, provenance, .. } = header;

@@ -77,7 +77,7 @@ pub fn count_pairs(gaussians: &[f32], camera: &Camera, config: &RasterConfig) ->
     for s in project_all(gaussians, camera, config) {
         let ([a, b, c], [x, y]) = (s.conic.map(|v| v.value), s.mean.map(|v| v.value));
         let reach = 2.0 * (255.0 * s.opacity.value).ln(); // the largest dx' conic dx
-        if !(reach > 0.0) {
+        if reach <= 0.0 {
             continue;
         }
         let det = a * c - b * b;
@@ -163,6 +163,7 @@ impl Neg for Dual {
 
 impl Mul for Dual {
     type Output = Self;
+    #[allow(clippy::suspicious_arithmetic_impl)] // the product rule
     fn mul(self, o: Self) -> Self {
         let d = std::array::from_fn(|k| self.d[k] * o.value + self.value * o.d[k]);
         Self { value: self.value * o.value, d }

@@ -9,9 +9,10 @@ use proptest::prelude::*;
 /// Largest difference, and the number of values that differ by more than `limit`.
 fn compare(found: &[f32], expected: &[f64], limit: f64) -> (f64, usize) {
     assert_eq!(found.len(), expected.len());
-    let differences = found.iter().zip(expected).map(|(f, e)| (f64::from(*f) - e).abs());
+    let distance = |(f, e): (&f32, &f64)| if f.is_nan() { f64::INFINITY } else { (f64::from(*f) - e).abs() };
+    let differences = found.iter().zip(expected).map(distance);
     let worst = differences.clone().fold(0.0, f64::max);
-    (worst, differences.filter(|d| !(*d <= limit)).count())
+    (worst, differences.filter(|d| *d > limit).count())
 }
 
 #[test]

@@ -1,5 +1,5 @@
-//! Both rasterisers against vectors from an independent reference in PyTorch float64 (tests/golden/README of the vectors:
-//! gsplat's conventions). Masked pixels are those where float32 may take another branch.
+//! Both rasterisers against vectors from an independent reference in PyTorch float64 (gsplat's
+//! conventions). Masked pixels are those where float32 may take another branch.
 
 use freerange_camera::Camera;
 use freerange_raster::{RasterConfig, reference, render, render_backward};

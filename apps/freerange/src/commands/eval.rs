@@ -1,6 +1,10 @@
 //! `freerange eval`
 
-use std::{path::{Path, PathBuf}, time::Instant};
+use std::{
+    ops::ControlFlow,
+    path::{Path, PathBuf},
+    time::Instant,
+};
 
 use freerange_camera::{Scene, View};
 use freerange_fit::{FitConfig, fit};
@@ -181,7 +185,10 @@ fn fit_alone(inputs: &[View], args: &Args) -> Result<Cloud, CliError> {
     let (frame, canonical) = pipeline::to_canonical(inputs, args.sampling.up())?;
     let config = FitConfig { seed: args.sampling.seed, ..FitConfig::default() };
     let mut bar = Progress::new("fitting", config.iterations as u64);
-    let cloud = fit(&canonical, None, &config, |p| bar.at(p.step as u64, &format!("loss {:.4}", p.loss)))?;
+    let cloud = fit(&canonical, None, &config, |p| {
+        bar.at(p.step as u64, &format!("loss {:.4}", p.loss));
+        ControlFlow::Continue(())
+    })?;
     bar.finish();
     Ok(to_user(&cloud, &frame.canonical_from_user))
 }

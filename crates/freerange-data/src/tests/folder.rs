@@ -5,8 +5,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use super::{assert_same, contents, message, metadata_of, tiny_config, toy, toy_config};
 use crate::generate::generate_with;
 use crate::{
-    DataError, Generated, GaussianSource, GenerateConfig, Manifest, Object, ObjectSource, ShardReader, ShardWriter, Shards,
-    contact_sheet, generate_shards, inspect,
+    DataError, GaussianSource, GenerateConfig, Generated, Manifest, Object, ObjectSource, ShardReader, ShardWriter,
+    Shards, contact_sheet, generate_shards, inspect,
 };
 
 fn quiet(_: u64, _: u64) {}
@@ -161,7 +161,8 @@ fn interruptions_and_threads_leave_no_trace() {
 #[test]
 fn failing_objects_are_recorded_and_the_rest_goes_on() {
     let folder = tempfile::tempdir().unwrap();
-    let broken = |what: &str| DataError::Config { field: what.into(), expected: "a whole one".into(), found: "none".into() };
+    let broken =
+        |what: &str| DataError::Config { field: what.into(), expected: "a whole one".into(), found: "none".into() };
     let make = |seed| if seed % 4 == 0 { Err(broken("mesh")) } else { Ok(toy(seed)) };
     let summary = generate_with(&toy_config(), folder.path(), quiet, make).unwrap();
     assert_eq!(summary.made, 7);
@@ -220,5 +221,6 @@ fn impossible_configurations_are_named() {
         },
         "quality_views",
     );
+    refused(&|c| (c.quality_views, c.object.polish) = (1, 5), "quality_views");
     toy_config().validate().unwrap();
 }

@@ -156,7 +156,7 @@ impl Dinov2 {
 
     /// All tokens after the final norm: class, registers, patches row by row.
     ///
-    /// `pixels`: `[b, 3, h, w]`, see [`imagenet_normalised`]. Returns `[b, 1 + registers + patches, d]`.
+    /// `pixels`: `[b, 3, h, w]`, normalised by the mean and deviation of ImageNet. Returns `[b, 1 + registers + patches, d]`.
     ///
     /// # Panics
     /// If the images are not RGB or smaller than a patch.

@@ -105,7 +105,7 @@ pub(crate) fn check(
     config: &RasterConfig,
 ) -> Result<[usize; 2], RasterError> {
     const MAX_SIZE: u32 = 16384;
-    if gaussians.len() % CHANNELS != 0 || gaussians.len() / CHANNELS > u32::MAX as usize {
+    if !gaussians.len().is_multiple_of(CHANNELS) || gaussians.len() / CHANNELS > u32::MAX as usize {
         let expected = gaussians.len() / CHANNELS * CHANNELS;
         return Err(RasterError::Length { field: "gaussians", expected, found: gaussians.len() });
     }
@@ -153,7 +153,7 @@ struct ViewState {
 }
 
 /// A slice's part for each view or band; empty slices have empty parts.
-fn parts<'a, T>(all: &'a mut [T], size: usize, count: usize) -> Vec<&'a mut [T]> {
+fn parts<T>(all: &mut [T], size: usize, count: usize) -> Vec<&mut [T]> {
     if all.is_empty() {
         (0..count).map(|_| Default::default()).collect()
     } else {
@@ -345,5 +345,56 @@ fn project_backward(rows: &[f32], first: usize, views: &[(Pinhole, &[[f32; SUMS]
     const FMA: bool = target_cfg_f!(any(target_feature = "fma", target_arch = "aarch64"));
     for (i, (rows, out)) in rows.chunks(LANES * CHANNELS).zip(out.chunks_mut(LANES * CHANNELS)).enumerate() {
         project::project_backward::<FMA>(rows, first + i * LANES, views, blur, out);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DVec3;
+
+    /// Image and gradients of a few Gaussians, through the kernels with or without fused multiply-add.
+    fn run<const FMA: bool>() -> (Vec<f32>, Vec<f32>) {
+        let (width, height, config) = (30, 14, RasterConfig { depth: true, ..RasterConfig::default() });
+        let eye = DVec3::new(1.2, -0.9, 0.4);
+        let camera = Pinhole::new(&Camera::look_at(eye, DVec3::ZERO, DVec3::Z, 0.9, width as u32, height as u32));
+        let rows: Vec<f32> = (0..20)
+            .flat_map(|i| {
+                let wave = |k: usize| (i as f32 * 1.3 + k as f32 * 2.1).sin();
+                (0..CHANNELS).map(move |k| if (3..6).contains(&k) { -2.5 + wave(k) } else { 0.6 * wave(k) })
+            })
+            .collect();
+        let mut splats = vec![];
+        for (i, rows) in rows.chunks(LANES * CHANNELS).enumerate() {
+            let size = [width as u32, height as u32];
+            project::project::<FMA>(rows, (i * LANES) as u32, &camera, size, &config, &mut splats);
+        }
+        let band = bin::bands(&splats, &bin::depth_order(&splats), height).remove(0);
+        let (mut color, mut alpha, mut depth) =
+            (vec![0.0; width * height * 3], vec![0.0; width * height], vec![0.0; width * height]);
+        let mut image = Rows { width, height, stride: 3, color: &mut color, alpha: &mut alpha, depth: &mut depth };
+        let band = tile::draw::<FMA, true>(0, band, [0.5; 3], &mut Lists::default(), &mut image);
+        let grads = RowGrads { width, height, stride: 3, color: &color, alpha: &alpha, depth: &depth };
+        let mut sums = vec![[0.0; SUMS]; band.splats.len()];
+        tile::backward::<FMA, true>(&band, [0.5; 3], &grads, &mut Scratch::default(), &mut sums);
+        let mut all = vec![[0.0; SUMS]; 20];
+        band.splats.iter().zip(sums).for_each(|(splat, sum)| all[splat.index as usize] = sum);
+        let mut out = vec![0.0; rows.len()];
+        for (i, (rows, out)) in rows.chunks(LANES * CHANNELS).zip(out.chunks_mut(LANES * CHANNELS)).enumerate() {
+            project::project_backward::<FMA>(rows, i * LANES, &[(camera, &all)], config.blur, out);
+        }
+        (color, out)
+    }
+
+    #[test]
+    fn machines_without_fused_multiply_add_get_the_same() {
+        let (with, without) = (run::<true>(), run::<false>());
+        for (with, without) in [(with.0, without.0), (with.1, without.1)] {
+            let largest = with.iter().fold(0.0, |m: f32, v| m.max(v.abs()));
+            assert!(largest > 0.5);
+            for (a, b) in with.iter().zip(&without) {
+                assert!((a - b).abs() <= 2e-5 * largest, "{a} and {b}, of {largest}");
+            }
+        }
     }
 }

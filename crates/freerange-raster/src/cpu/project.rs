@@ -172,7 +172,7 @@ fn project_lane<const FMA: bool>(mean: [f32; 3], m: &[[f32; 3]; 3], cam: &Pinhol
     Projected {
         p,
         iz,
-        clamped: [!(ux >= cam.low[0]) | !(ux <= cam.high[0]), !(uy >= cam.low[1]) | !(uy <= cam.high[1])],
+        clamped: [(ux < cam.low[0]) | (ux > cam.high[0]), (uy < cam.low[1]) | (uy > cam.high[1])],
         t,
         b,
         cov: [xx + blur, xy, yy + blur],

@@ -21,7 +21,7 @@ const X: Pixels = lanes(0, 0.5);
 const Y: Pixels = lanes(1, 0.5);
 
 const fn lanes(axis: usize, offset: f32) -> Pixels {
-    assert!(BLOCK[0] * BLOCK[1] == LANES && BAND % BLOCK[1] == 0);
+    assert!(BLOCK[0] * BLOCK[1] == LANES && BAND.is_multiple_of(BLOCK[1]));
     let mut out = [0.0; LANES];
     let mut l = 0;
     while l < LANES {
@@ -192,19 +192,19 @@ fn blend<const FMA: bool, const DEPTH: bool>(block: &mut Block, run: &[Splat], l
     open
 }
 
-/// Buffers that outlive a call: what one block's splats did at each of its pixels.
+/// What the splats of one block do at each of its pixels, from near to far. Outlives a call, and only grows.
 #[derive(Default)]
 pub struct Scratch {
+    /// Positions in the band.
     splats: Vec<u32>,
-    alpha_weight: Vec<[Pixels; 2]>,
+    /// First alpha, later d loss / d ln(alpha); and the blending weight.
+    pixels: Vec<[Pixels; 2]>,
+    /// How many of them are in use.
+    count: usize,
 }
 
 /// Pulls d loss / d image back to the splats of `band`: `sums` has a row for each, see [`SUMS`]. Returns
 /// d loss / d background.
-///
-/// Each block is blended once more from near to far, noting each splat's alpha and weight w = T alpha. Then, from far
-/// to near, with `behind` the colour that is seen where the splat is not (times d loss / d colour):
-/// d loss / d ln(alpha) = w (colour - behind), and behind += alpha (colour - behind).
 #[inline(always)]
 pub fn backward<const FMA: bool, const DEPTH: bool>(
     band: &Band,
@@ -218,10 +218,8 @@ pub fn backward<const FMA: bool, const DEPTH: bool>(
     for i in 0..across * grads.height.div_ceil(BLOCK[1]) {
         let (x0, y0) = (i % across * BLOCK[0], i / across * BLOCK[1]);
         let mut t = [0f32; LANES];
-        let mut t_final = [1f32; LANES];
         let mut d = [[0f32; LANES]; 4]; // d loss / d (red, green, blue, depth)
-        let mut d_transposed = [[0f32; 4]; LANES];
-        let mut behind = [0f32; LANES];
+        let mut behind = [0f32; LANES]; // the colour seen behind the last splat, times d loss / d colour
         each_inside(x0, y0, grads.width, grads.height, |l, pixel| {
             t[l] = 1.0;
             for c in 0..3 {
@@ -236,81 +234,137 @@ pub fn backward<const FMA: bool, const DEPTH: bool>(
             if DEPTH {
                 d[3][l] = grads.depth[pixel];
             }
-            d_transposed[l] = [d[0][l], d[1][l], d[2][l], d[3][l]];
         });
-
-        let (x, y) = (x0 as f32, (band.top + y0) as f32);
-        scratch.splats.clear();
-        scratch.alpha_weight.clear();
-        'near_to_far: for chunk in &band.chunks {
-            for group in chunk.of_block(i).chunks(CHECK) {
-                for &entry in group {
-                    let index = chunk.first + usize::from(entry);
-                    let s = &band.splats[index];
-                    let mut noted = [[0f32; LANES]; 2];
-                    for l in 0..LANES {
-                        let alpha = opacity::<FMA>(s, x, y, l);
-                        let next = t[l] * (1.0 - alpha);
-                        let go_on = next > MIN_TRANSMITTANCE;
-                        noted[0][l] = if go_on { alpha } else { 0.0 };
-                        noted[1][l] = if go_on { t[l] * alpha } else { 0.0 };
-                        t[l] = if go_on { next } else { 0.0 };
-                        t_final[l] = if go_on { next } else { t_final[l] };
-                    }
-                    scratch.splats.push(index as u32);
-                    scratch.alpha_weight.push(noted);
-                }
-                if t.iter().fold(0, |any, v| any | v.to_bits()) == 0 {
-                    break 'near_to_far;
-                }
-            }
-        }
+        let corner = [x0 as f32, (band.top + y0) as f32];
+        let t_final = near_to_far::<FMA>(band, i, corner, t, scratch);
         for c in 0..3 {
-            for l in 0..LANES {
-                d_background[c] += t_final[l] * d[c][l];
-            }
+            d_background[c] += t_final.iter().zip(&d[c]).map(|(t, d)| t * d).sum::<f32>();
         }
+        far_to_near::<FMA, DEPTH>(band, behind, &d, scratch);
+        add_up::<FMA>(band, corner, &d, scratch, sums);
+    }
+    d_background
+}
 
-        let (middle_x, middle_y) = (x + 0.5 * BLOCK[0] as f32, y + 0.5 * BLOCK[1] as f32);
-        for (&index, [alpha, weight]) in scratch.splats.iter().zip(&scratch.alpha_weight).rev() {
-            let s = &band.splats[index as usize];
-            let mut g = [0f32; LANES];
-            for l in 0..LANES {
-                let mut color = s.color[0] * d[0][l];
-                color = fma::<FMA>(s.color[1], d[1][l], color);
-                color = fma::<FMA>(s.color[2], d[2][l], color);
-                if DEPTH {
-                    color = fma::<FMA>(s.depth, d[3][l], color);
+/// Blends the splats of `block` as [`draw`] did, noting alpha and weight of each. `t` is 1 at pixels of the image.
+/// Returns the transmittance of all of them.
+#[inline(always)]
+fn near_to_far<const FMA: bool>(
+    band: &Band,
+    block: usize,
+    [x, y]: [f32; 2],
+    mut t: Pixels,
+    scratch: &mut Scratch,
+) -> Pixels {
+    let mut t_final = [1f32; LANES];
+    // Room for all beforehand: a call that may grow a vector would push the lanes out of the registers.
+    let count = band.chunks.iter().map(|chunk| chunk.of_block(block).len()).sum();
+    if scratch.splats.len() < count {
+        scratch.splats.resize(count, 0);
+        scratch.pixels.resize(count, [[0.0; LANES]; 2]);
+    }
+    let mut k = 0;
+    for chunk in &band.chunks {
+        let run = &band.splats[chunk.first..];
+        for group in chunk.of_block(block).chunks(CHECK) {
+            for &i in group {
+                let s = &run[usize::from(i)];
+                let mut noted = [[0f32; LANES]; 2];
+                for l in 0..LANES {
+                    let alpha = opacity::<FMA>(s, x, y, l);
+                    let next = t[l] * (1.0 - alpha);
+                    let go_on = next > MIN_TRANSMITTANCE;
+                    noted[0][l] = if go_on { alpha } else { 0.0 };
+                    noted[1][l] = if go_on { t[l] * alpha } else { 0.0 };
+                    t[l] = if go_on { next } else { 0.0 };
+                    t_final[l] = if go_on { next } else { t_final[l] };
                 }
-                let difference = color - behind[l];
-                behind[l] = fma::<FMA>(alpha[l], difference, behind[l]);
-                // No derivative through the upper bound on alpha.
-                g[l] = if alpha[l] < MAX_ALPHA { weight[l] * difference } else { 0.0 };
+                scratch.splats[k] = (chunk.first + usize::from(i)) as u32;
+                scratch.pixels[k] = noted;
+                k += 1;
             }
-            let mut m = [0f32; 8];
-            let mut color = [0f32; 4];
-            for l in 0..LANES {
-                for k in 0..8 {
-                    m[k] = fma::<FMA>(g[l], MOMENTS[l][k], m[k]);
-                }
-                for k in 0..4 {
-                    color[k] = fma::<FMA>(weight[l], d_transposed[l][k], color[k]);
-                }
-            }
-            // Moments about the mean of the splat instead of the middle of the block.
-            let (cx, cy) = (middle_x - s.x, middle_y - s.y);
-            let (sx, sy) = (fma::<FMA>(cx, m[0], m[1]), fma::<FMA>(cy, m[0], m[2]));
-            let sum = &mut sums[index as usize];
-            sum[0] += m[0];
-            sum[1] += sx;
-            sum[2] += sy;
-            sum[3] += m[3] + cx * (m[1] + sx);
-            sum[4] += m[4] + cy * m[1] + cx * sy;
-            sum[5] += m[5] + cy * (m[2] + sy);
-            for k in 0..4 {
-                sum[6 + k] += color[k];
+            if t.iter().fold(0, |any, v| any | v.to_bits()) == 0 {
+                scratch.count = k;
+                return t_final;
             }
         }
     }
-    d_background
+    scratch.count = k;
+    t_final
+}
+
+/// Replaces the alphas by d loss / d ln(alpha) = weight (colour - colour behind), where colours are times
+/// d loss / d colour. What is seen in front of a splat follows from what is seen behind it:
+/// behind += alpha (colour - behind).
+#[inline(always)]
+fn far_to_near<const FMA: bool, const DEPTH: bool>(
+    band: &Band,
+    mut behind: Pixels,
+    d: &[Pixels; 4],
+    scratch: &mut Scratch,
+) {
+    let d = *d;
+    let count = scratch.count;
+    for (&i, pixels) in scratch.splats[..count].iter().zip(&mut scratch.pixels[..count]).rev() {
+        let s = &band.splats[i as usize];
+        let [alpha, weight] = *pixels;
+        let mut g = [0f32; LANES];
+        for l in 0..LANES {
+            let mut color = s.color[0] * d[0][l];
+            color = fma::<FMA>(s.color[1], d[1][l], color);
+            color = fma::<FMA>(s.color[2], d[2][l], color);
+            if DEPTH {
+                color = fma::<FMA>(s.depth, d[3][l], color);
+            }
+            let difference = color - behind[l];
+            behind[l] = fma::<FMA>(alpha[l], difference, behind[l]);
+            // No derivative through the upper bound on alpha.
+            g[l] = if alpha[l] < MAX_ALPHA { weight[l] * difference } else { 0.0 };
+        }
+        pixels[0] = g;
+    }
+}
+
+/// Sums over the pixels of the block: products with fixed columns, a small matrix product.
+#[inline(always)]
+fn add_up<const FMA: bool>(
+    band: &Band,
+    [x, y]: [f32; 2],
+    d: &[Pixels; 4],
+    scratch: &Scratch,
+    sums: &mut [[f32; SUMS]],
+) {
+    let mut columns = [[0f32; 4]; LANES];
+    for l in 0..LANES {
+        columns[l] = [d[0][l], d[1][l], d[2][l], d[3][l]];
+    }
+    // Rows of eight as they are: knowing the numbers, the compiler would take them apart.
+    let moments = std::hint::black_box(&MOMENTS);
+    let middle = [x + 0.5 * BLOCK[0] as f32, y + 0.5 * BLOCK[1] as f32];
+    for (&i, [g, weight]) in scratch.splats[..scratch.count].iter().zip(&scratch.pixels) {
+        let mut m = [0f32; 8];
+        let mut color = [0f32; 4];
+        for l in 0..LANES {
+            for k in 0..8 {
+                m[k] = fma::<FMA>(g[l], moments[l][k], m[k]);
+            }
+            for k in 0..4 {
+                color[k] = fma::<FMA>(weight[l], columns[l][k], color[k]);
+            }
+        }
+        // Moments about the mean of the splat instead of the middle of the block.
+        let s = &band.splats[i as usize];
+        let (cx, cy) = (middle[0] - s.x, middle[1] - s.y);
+        let (sx, sy) = (fma::<FMA>(cx, m[0], m[1]), fma::<FMA>(cy, m[0], m[2]));
+        let sum = &mut sums[i as usize];
+        sum[0] += m[0];
+        sum[1] += sx;
+        sum[2] += sy;
+        sum[3] += m[3] + cx * (m[1] + sx);
+        sum[4] += m[4] + cy * m[1] + cx * sy;
+        sum[5] += m[5] + cy * (m[2] + sy);
+        for k in 0..4 {
+            sum[6 + k] += color[k];
+        }
+    }
 }
