@@ -60,7 +60,7 @@ impl Stream {
     }
 
     /// The next object. Waits for it if need be.
-    pub fn next(&mut self) -> Result<Object, DataError> {
+    pub fn take_next(&mut self) -> Result<Object, DataError> {
         let queue = &self.queues[(self.next % self.queues.len() as u64) as usize];
         let index = self.next;
         self.next += 1;

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use freerange_data::ObjectConfig;
-use freerange_model::ModelConfig;
+use freerange_model::{Compute, ModelConfig};
 
 use crate::{FlowError, coupling::Coupling, path::TimeSchedule, sample::SampleConfig};
 
@@ -123,6 +123,8 @@ pub struct OptimizerConfig {
     pub clip: f32,
     /// Decay of the moving average of the weights (reached gradually over the first steps).
     pub ema: f32,
+    /// Arithmetic of the blocks' linear layers; weights and sums stay in 32 bits.
+    pub compute: Compute,
 }
 
 impl Default for OptimizerConfig {
@@ -135,6 +137,7 @@ impl Default for OptimizerConfig {
             betas: (0.9, 0.95),
             clip: 1.0,
             ema: 0.9999,
+            compute: Compute::F32,
         }
     }
 }
@@ -206,6 +209,7 @@ impl TrainConfig {
         };
         self.model.validate()?;
         self.sample.validate()?;
+        self.data.object.validate()?;
         check(!self.stages.is_empty(), "stage", "at least one [[stage]]", "none".into())?;
         for s in &self.stages {
             check((1..=20).contains(&s.depth), "stage.depth", "1 to 20", s.depth.to_string())?;

@@ -14,7 +14,7 @@ use burn::{
     tensor::{Device, Tensor},
 };
 use freerange_data::{Generated, Object, ObjectSource, Stream};
-use freerange_model::{Checkpoint, FreeRange, ModelConfig};
+use freerange_model::{Checkpoint, Compute, FreeRange, ModelConfig};
 use freerange_splat::{Normalization, Statistics, channel};
 use rand::seq::index::sample as sample_indices;
 
@@ -101,7 +101,7 @@ impl Trainer {
             }),
         };
         let tracked = plain.clone().autodiff();
-        let mut model = FreeRange::new(&config.model, &mut step_rng(config.seed, u64::MAX), &tracked)?;
+        let mut model = FreeRange::new(&config.model, &mut step_rng(config.seed, u64::MAX), &tracked)?.with_compute(config.optimizer.compute);
         let o = &config.optimizer;
         let mut optimizer = AdamWConfig::new()
             .with_weight_decay(o.weight_decay)
@@ -149,7 +149,7 @@ impl Trainer {
         let first = state.step * config.data.fresh as u64;
         let mut stream = Stream::start(source.clone(), first, config.data.workers);
         progress(&format!("filling the window with {} objects", config.data.window));
-        let window = (0..config.data.window).map(|_| Ok(Arc::new(stream.next()?)));
+        let window = (0..config.data.window).map(|_| Ok(Arc::new(stream.take_next()?)));
         let window = window.collect::<Result<VecDeque<_>, FlowError>>()?;
         Ok(Self {
             photometric: Photometric::new(&state.normalization, &plain),
@@ -192,7 +192,7 @@ impl Trainer {
         let batch =
             Batch::draw(&chosen, &stage, &model_config, loss, &self.progress.normalization, &mut rng, &self.device)?;
         for _ in 0..self.config.data.fresh {
-            self.window.push_back(Arc::new(self.stream.next()?));
+            self.window.push_back(Arc::new(self.stream.take_next()?));
             self.window.pop_front();
         }
         let data_seconds = begin.elapsed().as_secs_f64();
@@ -267,7 +267,8 @@ impl Trainer {
         }
         std::fs::create_dir_all(&partial).map_err(io(&partial))?;
         let broken = |name: &str, e: String| FlowError::State { path: partial.join(name), problem: e };
-        let average = self.average.apply(self.model.clone().valid());
+        // Sampling chooses its own arithmetic.
+        let average = self.average.apply(self.model.clone().valid()).with_compute(Compute::F32);
         let model = self.model.clone().into_record();
         model.save(partial.join("model")).map_err(|e| broken("model", e.to_string()))?;
         let record = average.clone().into_record();
@@ -360,6 +361,7 @@ fn check_same_run(config: &TrainConfig, folder: &Path) -> Result<(), FlowError> 
                 c.stages.iter_mut().for_each(|s| s.steps = 0);
                 c.sample = Default::default();
                 c.data.workers = 0;
+                c.optimizer.compute = Default::default();
                 c
             };
             if essence(&old) != essence(config) {

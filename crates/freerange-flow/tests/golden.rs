@@ -37,7 +37,7 @@ fn assert_close(found: &[f32], expected: &[f32], relative: f32, what: &str) {
 }
 
 fn values<const D: usize>(t: Tensor<D>) -> Vec<f32> {
-    t.into_data().to_vec().unwrap()
+    t.into_data().try_to_vec().unwrap()
 }
 
 #[test]

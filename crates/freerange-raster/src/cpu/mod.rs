@@ -360,7 +360,7 @@ mod tests {
         let camera = Pinhole::new(&Camera::look_at(eye, DVec3::ZERO, DVec3::Z, 0.9, width as u32, height as u32));
         let rows: Vec<f32> = (0..20)
             .flat_map(|i| {
-                let wave = |k: usize| (i as f32 * 1.3 + k as f32 * 2.1).sin();
+                let wave = move |k: usize| (i as f32 * 1.3 + k as f32 * 2.1).sin();
                 (0..CHANNELS).map(move |k| if (3..6).contains(&k) { -2.5 + wave(k) } else { 0.6 * wave(k) })
             })
             .collect();

@@ -128,6 +128,7 @@ struct Projected {
     t: [[f32; 3]; 2],   // Jacobian of the projection times the camera's rotation
     b: [[f32; 3]; 2],   // t x m: the covariance in the image is b b' + blur
     cov: [f32; 3],      // xx, xy, yy with blur
+    minor: [f32; 3],    // of b: columns 12, 20, 01
     inverse_det: f32,
     mean: [f32; 2],
 }
@@ -176,6 +177,7 @@ fn project_lane<const FMA: bool>(mean: [f32; 3], m: &[[f32; 3]; 3], cam: &Pinhol
         t,
         b,
         cov: [xx + blur, xy, yy + blur],
+        minor,
         inverse_det: 1.0 / det,
         mean: [fma::<FMA>(cam.focal[0], ux, cam.center[0]), fma::<FMA>(cam.focal[1], uy, cam.center[1])],
     }
@@ -295,6 +297,7 @@ pub fn project_backward<const FMA: bool>(
     let channels = load(rows);
     let mut d_mean = [[0f32; LANES]; 3];
     let mut d_m = [[0f32; LANES]; 9];
+    let mut d_log_scale = [[0f32; LANES]; 3];
     let mut d_color = [[0f32; LANES]; 3];
     let mut d_log_opacity = [0f32; LANES];
     let mut touched = [0f32; LANES];
@@ -314,19 +317,25 @@ pub fn project_backward<const FMA: bool>(
             let d_x = ka * s[1][l] + kb * s[2][l];
             let d_y = kb * s[1][l] + kc * s[2][l];
             // d loss / d covariance = K (sum g d d') K / 2, hence d loss / d b = K (sum g d d') K b.
-            let h = [
-                [ka * sxx + kb * sxy, ka * sxy + kb * syy],
-                [kb * sxx + kc * sxy, kb * sxy + kc * syy], //
+            // K b by the minors of b: the entries of K times b would cancel for needles.
+            let ([bx, by], [m12, m20, m01]) = (v.b, v.minor);
+            let kbx = [
+                v.inverse_det * (by[1] * m01 - by[2] * m20 + blur * bx[0]),
+                v.inverse_det * (by[2] * m12 - by[0] * m01 + blur * bx[1]),
+                v.inverse_det * (by[0] * m20 - by[1] * m12 + blur * bx[2]),
             ];
-            let (hxx, hxy, hyy) = (
-                h[0][0] * ka + h[0][1] * kb,
-                h[0][0] * kb + h[0][1] * kc,
-                h[1][0] * kb + h[1][1] * kc, //
-            );
+            let kby = [
+                v.inverse_det * (bx[2] * m20 - bx[1] * m01 + blur * by[0]),
+                v.inverse_det * (bx[0] * m01 - bx[2] * m12 + blur * by[1]),
+                v.inverse_det * (bx[1] * m12 - bx[0] * m20 + blur * by[2]),
+            ];
             let mut d_b = [[0f32; 3]; 2];
+            let mut d_scale = [0f32; 3];
             for k in 0..3 {
-                d_b[0][k] = hxx * v.b[0][k] + hxy * v.b[1][k];
-                d_b[1][k] = hxy * v.b[0][k] + hyy * v.b[1][k];
+                let (px, py) = (sxx * kbx[k] + sxy * kby[k], sxy * kbx[k] + syy * kby[k]);
+                d_scale[k] = kbx[k] * px + kby[k] * py; // b' d loss / d b
+                d_b[0][k] = ka * px + kb * py;
+                d_b[1][k] = kb * px + kc * py;
             }
             let m = &shape.m;
             let (mut d_t, w) = ([[0f32; 3]; 2], &cam.rotation);
@@ -361,6 +370,7 @@ pub fn project_backward<const FMA: bool>(
             for k in 0..3 {
                 d_mean[k][l] += pick(dot::<FMA>([w[0][k], w[1][k], w[2][k]], d_p));
                 d_color[k][l] += s[6 + k][l];
+                d_log_scale[k][l] += pick(d_scale[k]);
             }
             for k in 0..9 {
                 d_m[k][l] += pick(d_matrix[k]);
@@ -370,7 +380,7 @@ pub fn project_backward<const FMA: bool>(
     }
     let mut d = [[0f32; LANES]; CHANNELS];
     for l in 0..LANES {
-        let Shape { m, s, q: [w, x, y, z], inverse_norm, .. } = shape::<FMA>(&channels, l);
+        let Shape { s, q: [w, x, y, z], inverse_norm, .. } = shape::<FMA>(&channels, l);
         // m = r diag(s)
         let mut g = [[0f32; 3]; 3]; // d loss / d r
         for i in 0..3 {
@@ -378,11 +388,6 @@ pub fn project_backward<const FMA: bool>(
                 g[i][k] = d_m[3 * i + k][l] * s[k];
             }
         }
-        let d_log_scale = [
-            d_m[0][l] * m[0][0] + d_m[3][l] * m[1][0] + d_m[6][l] * m[2][0],
-            d_m[1][l] * m[0][1] + d_m[4][l] * m[1][1] + d_m[7][l] * m[2][1],
-            d_m[2][l] * m[0][2] + d_m[5][l] * m[1][2] + d_m[8][l] * m[2][2],
-        ];
         let dq = [
             2.0 * (x * (g[2][1] - g[1][2]) + y * (g[0][2] - g[2][0]) + z * (g[1][0] - g[0][1])),
             2.0 * (y * (g[0][1] + g[1][0]) + z * (g[0][2] + g[2][0]) - 2.0 * x * (g[1][1] + g[2][2])
@@ -400,7 +405,7 @@ pub fn project_backward<const FMA: bool>(
         let pick = |value: f32| if touched[l] == 0.0 { 0.0 } else { value };
         for k in 0..3 {
             d[k][l] = d_mean[k][l];
-            d[3 + k][l] = pick(d_log_scale[k]);
+            d[3 + k][l] = d_log_scale[k][l];
             d[11 + k][l] = d_color[k][l];
         }
         for k in 0..4 {
