@@ -58,8 +58,7 @@ pub fn write_turntable(path: &Path, cloud: &Cloud, frames: u32, size: u32) -> Re
     for i in 0..frames {
         let azimuth = std::f64::consts::TAU * f64::from(i) / f64::from(frames);
         let elevation = 20f64.to_radians();
-        let direction =
-            DVec3::new(azimuth.cos() * elevation.cos(), azimuth.sin() * elevation.cos(), elevation.sin());
+        let direction = DVec3::new(azimuth.cos() * elevation.cos(), azimuth.sin() * elevation.cos(), elevation.sin());
         let camera = Camera::look_at(1.6 * direction, DVec3::ZERO, DVec3::Z, 45f64.to_radians(), size, size);
         let picture = to_picture(&render_view(cloud, &camera)?, size, size);
         let frame = Frame::from_parts(picture, 0, 0, Delay::from_numer_denom_ms(2000, frames.max(1)));

@@ -15,8 +15,7 @@ pub struct Progress {
     bar: ProgressBar,
     label: String,
     total: u64,
-    begin: Instant,
-    last_line: Option<Instant>,
+    last_line: Instant,
 }
 
 impl Progress {
@@ -26,23 +25,20 @@ impl Progress {
             true => ProgressDrawTarget::stderr(),
             false => ProgressDrawTarget::hidden(),
         };
-        let style = ProgressStyle::with_template("{prefix:>12} {bar:32} {pos}/{len} {eta} {msg}").expect("a valid template");
+        let style =
+            ProgressStyle::with_template("{prefix:>12} {bar:32} {pos}/{len} {eta} {msg}").expect("a valid template");
         let bar = ProgressBar::with_draw_target(Some(total), target).with_style(style).with_prefix(label.to_owned());
-        Self { bar, label: label.into(), total, begin: Instant::now(), last_line: None }
+        Self { bar, label: label.into(), total, last_line: Instant::now() }
     }
 
     /// `done` steps are done; `message` says more.
     pub fn at(&mut self, done: u64, message: &str) {
         self.bar.set_position(done);
         self.bar.set_message(message.to_owned());
-        if self.bar.is_hidden() && self.last_line.is_none_or(|t| t.elapsed() >= LINE_EVERY) {
-            // The first line waits too: quick tasks need none.
-            if self.last_line.is_some() || self.begin.elapsed() >= LINE_EVERY {
-                eprintln!("{}: {done}/{} {message}", self.label, self.total);
-                self.last_line = Some(Instant::now());
-            } else if self.begin.elapsed() < LINE_EVERY {
-                return;
-            }
+        // The first line waits too: quick tasks need none.
+        if self.bar.is_hidden() && self.last_line.elapsed() >= LINE_EVERY {
+            eprintln!("{}: {done}/{} {message}", self.label, self.total);
+            self.last_line = Instant::now();
         }
     }
 

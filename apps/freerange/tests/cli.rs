@@ -64,7 +64,8 @@ fn refused(scene: &Path, extra: &[&str], words: &[&str]) {
 
 #[test]
 fn help_and_version() {
-    for args in [&["--help"][..], &["--version"], &["reconstruct", "--help"], &["data", "--help"], &["train", "--help"]] {
+    for args in [&["--help"][..], &["--version"], &["reconstruct", "--help"], &["data", "--help"], &["train", "--help"]]
+    {
         let done = freerange(args);
         assert!(done.status.success());
         assert!(!done.stdout.is_empty());
@@ -204,7 +205,10 @@ fn truncated_or_foreign_checkpoint() {
 fn a_ply_with_a_lying_element_count() {
     let place = tempfile::tempdir().unwrap();
     let file = place.path().join("liar.ply");
-    let properties = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"];
+    let properties = [
+        "x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1",
+        "rot_2", "rot_3",
+    ];
     let mut text = "ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\n".to_owned();
     properties.iter().for_each(|p| text += &format!("property float {p}\n"));
     text += "end_header\n";
@@ -237,7 +241,18 @@ fn bad_numbers_on_the_command_line() {
 #[test]
 #[cfg(target_os = "linux")]
 fn a_full_disk() {
-    let done = freerange(&["eval", example().to_str().unwrap(), "--inputs", "transforms_train.json", "--validate", "transforms_test.json", "--method", "white", "--output", "/dev/full/report.json"]);
+    let done = freerange(&[
+        "eval",
+        example().to_str().unwrap(),
+        "--inputs",
+        "transforms_train.json",
+        "--validate",
+        "transforms_test.json",
+        "--method",
+        "white",
+        "--output",
+        "/dev/full/report.json",
+    ]);
     let message = String::from_utf8_lossy(&done.stderr).into_owned();
     assert_eq!(done.status.code(), Some(2), "{message}");
     assert!(message.contains("/dev/full"), "{message}");

@@ -100,7 +100,11 @@ fn matrix_products(config: &TrainConfig, stage: &Stage, device: &Device) -> f64 
 fn machine() -> String {
     let text = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let model = text.lines().find_map(|l| l.strip_prefix("model name")).unwrap_or("unknown processor");
-    format!("{}, {} cores", model.trim_start_matches([' ', '\t', ':']), std::thread::available_parallelism().map_or(0, usize::from))
+    format!(
+        "{}, {} cores",
+        model.trim_start_matches([' ', '\t', ':']),
+        std::thread::available_parallelism().map_or(0, usize::from)
+    )
 }
 
 fn output(program: &str, arguments: &[&str]) -> String {

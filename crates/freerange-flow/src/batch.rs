@@ -126,7 +126,11 @@ impl Batch {
         let (mut t, mut conditional, mut backgrounds) = (Vec::new(), Vec::new(), Vec::new());
         let (mut seen, mut held) = (Vec::new(), Vec::new());
         for object in objects {
-            let clean = normalization.normalize(object.slice(stage.depth)?);
+            let slice = object.slice(stage.depth)?;
+            let clean = match loss.random_patches {
+                true => normalization.normalize(&slice.shuffled(rng)),
+                false => normalization.normalize(slice),
+            };
             let mut start: Vec<f32> = (0..clean.len()).map(|_| StandardNormal.sample(rng)).collect();
             loss.coupling.pair(&mut start, &clean);
             data.extend(clean);

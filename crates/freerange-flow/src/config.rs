@@ -52,7 +52,14 @@ pub struct DataConfig {
 
 impl Default for DataConfig {
     fn default() -> Self {
-        Self { shards: None, object: ObjectConfig::default(), window: 64, fresh: 2, workers: 1, statistics_objects: 256 }
+        Self {
+            shards: None,
+            object: ObjectConfig::default(),
+            window: 64,
+            fresh: 2,
+            workers: 1,
+            statistics_objects: 256,
+        }
     }
 }
 
@@ -80,6 +87,8 @@ pub struct LossConfig {
     pub time: TimeSchedule,
     /// How noise is paired with Gaussians.
     pub coupling: Coupling,
+    /// Tokens of Gaussians picked at random instead of neighbours in the tree (an ablation of the paper).
+    pub random_patches: bool,
     /// Fewest and most input views; the number is drawn for each batch.
     pub input_views: (usize, usize),
     /// Share of the batches whose input views all lie on one side of the object.
@@ -99,6 +108,7 @@ impl Default for LossConfig {
             unconditional: 0.1,
             time: TimeSchedule::Cosine,
             coupling: Coupling::Independent,
+            random_patches: false,
             input_views: (4, 4),
             one_sided: 0.0,
         }
@@ -172,8 +182,8 @@ impl TrainConfig {
     /// Reads and checks a configuration file.
     pub fn load(path: &Path) -> Result<Self, FlowError> {
         let text = std::fs::read_to_string(path).map_err(|source| FlowError::Io { path: path.into(), source })?;
-        let config: Self = toml::from_str(&text)
-            .map_err(|e| FlowError::State { path: path.into(), problem: e.to_string() })?;
+        let config: Self =
+            toml::from_str(&text).map_err(|e| FlowError::State { path: path.into(), problem: e.to_string() })?;
         config.validate()?;
         Ok(config)
     }
@@ -228,6 +238,12 @@ impl TrainConfig {
             views.to_string(),
         )?;
         check(l.flow || l.seen || l.held, "loss", "at least one term", "none".into())?;
+        check(
+            !(l.random_patches && l.coupling == Coupling::Tree),
+            "loss.random_patches",
+            "false with coupling = \"tree\", which needs the tree's order",
+            "true".into(),
+        )?;
         check((0.0..=1.0).contains(&l.unconditional), "loss.unconditional", "0 to 1", l.unconditional.to_string())?;
         check((0.0..=1.0).contains(&l.one_sided), "loss.one_sided", "0 to 1", l.one_sided.to_string())?;
         check(

@@ -112,7 +112,8 @@ mod tests {
         let mut paired = noise.clone();
         Coupling::Tree.pair(&mut paired, &data);
         let sorted = |x: &[f32]| {
-            let mut rows: Vec<Vec<u32>> = x.chunks(channel::COUNT).map(|r| r.iter().map(|v| v.to_bits()).collect()).collect();
+            let mut rows: Vec<Vec<u32>> =
+                x.chunks(channel::COUNT).map(|r| r.iter().map(|v| v.to_bits()).collect()).collect();
             rows.sort();
             rows
         };

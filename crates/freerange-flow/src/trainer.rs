@@ -101,7 +101,8 @@ impl Trainer {
             }),
         };
         let tracked = plain.clone().autodiff();
-        let mut model = FreeRange::new(&config.model, &mut step_rng(config.seed, u64::MAX), &tracked)?.with_compute(config.optimizer.compute);
+        let mut model = FreeRange::new(&config.model, &mut step_rng(config.seed, u64::MAX), &tracked)?
+            .with_compute(config.optimizer.compute);
         let o = &config.optimizer;
         let mut optimizer = AdamWConfig::new()
             .with_weight_decay(o.weight_decay)
@@ -118,11 +119,13 @@ impl Trainer {
                 let broken = |name: &str, e: String| FlowError::State { path: path.join(name), problem: e };
                 let record = |name: &str| ModuleRecord::load(state(name)).map_err(|e| broken(name, e.to_string()));
                 let average = model.clone().valid();
-                let average = average.try_load_record(record("average")?).map_err(|e| broken("average", e.to_string()))?;
+                let average =
+                    average.try_load_record(record("average")?).map_err(|e| broken("average", e.to_string()))?;
                 model = model.try_load_record(record("model")?).map_err(|e| broken("model", e.to_string()))?;
                 optimizer = optimizer.load(state("optimizer")).map_err(|e| broken("optimizer", e.to_string()))?;
                 let file = state("progress.json");
-                let text = std::fs::read_to_string(&file).map_err(|source| FlowError::Io { path: file.clone(), source })?;
+                let text =
+                    std::fs::read_to_string(&file).map_err(|source| FlowError::Io { path: file.clone(), source })?;
                 let progress = serde_json::from_str::<Progress>(&text)
                     .map_err(|e| FlowError::State { path: file, problem: e.to_string() })?;
                 (progress, Weights::of(&average))
@@ -349,12 +352,12 @@ fn measure(source: &dyn ObjectSource, count: u64, depth: u32) -> Result<Normaliz
 /// A run's folder holds its configuration: going on with another one would mix two runs.
 fn check_same_run(config: &TrainConfig, folder: &Path) -> Result<(), FlowError> {
     let path = folder.join("config.toml");
-    let text = toml::to_string_pretty(config)
-        .map_err(|e| FlowError::State { path: path.clone(), problem: e.to_string() })?;
+    let text =
+        toml::to_string_pretty(config).map_err(|e| FlowError::State { path: path.clone(), problem: e.to_string() })?;
     match std::fs::read_to_string(&path) {
         Ok(old) => {
-            let old: TrainConfig = toml::from_str(&old)
-                .map_err(|e| FlowError::State { path: path.clone(), problem: e.to_string() })?;
+            let old: TrainConfig =
+                toml::from_str(&old).map_err(|e| FlowError::State { path: path.clone(), problem: e.to_string() })?;
             // Running longer is no other run; neither is sampling otherwise, or with more threads.
             let essence = |c: &TrainConfig| {
                 let mut c = c.clone();
@@ -380,7 +383,10 @@ fn states(folder: &Path) -> Result<Vec<PathBuf>, FlowError> {
     let mut found: Vec<PathBuf> = entries
         .filter_map(|e| e.ok().map(|e| e.path()))
         .filter(|p| {
-            p.file_name().and_then(|n| n.to_str()).and_then(|n| n.strip_prefix("state-")).is_some_and(|n| n.parse::<u64>().is_ok())
+            p.file_name()
+                .and_then(|n| n.to_str())
+                .and_then(|n| n.strip_prefix("state-"))
+                .is_some_and(|n| n.parse::<u64>().is_ok())
         })
         .collect();
     found.sort();

@@ -51,7 +51,12 @@ impl Weights {
 }
 
 /// Scales all gradients so that their joint Euclidean norm is at most `limit`. Returns the norm before.
-pub(crate) fn clip_global_norm<M: Module>(gradients: &mut GradientsParams, module: &M, limit: f32, device: &Device) -> f32 {
+pub(crate) fn clip_global_norm<M: Module>(
+    gradients: &mut GradientsParams,
+    module: &M,
+    limit: f32,
+    device: &Device,
+) -> f32 {
     struct Sum<'a>(&'a GradientsParams, Tensor<1>);
     impl ModuleVisitor for Sum<'_> {
         fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {

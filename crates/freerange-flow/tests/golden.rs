@@ -129,7 +129,12 @@ fn euler_with_both_guidances_on_the_toy_model() {
         assert_close(&trajectory, &expected[..trajectory.len()], 1e-4, &format!("{name}: trajectory"));
         assert_close(&estimates, &v["out/zhat_guided"].1, 1e-4, &format!("{name}: estimates"));
         let rows = values(last).len();
-        assert_close(&estimates[estimates.len() - rows..], &v["out/zhat_guided"].1[estimates.len() - rows..], 1e-4, "last");
+        assert_close(
+            &estimates[estimates.len() - rows..],
+            &v["out/zhat_guided"].1[estimates.len() - rows..],
+            1e-4,
+            "last",
+        );
     }
 }
 

@@ -97,12 +97,20 @@ fn one_object_is_learned_sampled_and_rendered() {
     let config = config(700);
     let losses = train(&config, folder.path(), 700);
     let mean = |x: &[f32]| x.iter().sum::<f32>() / x.len() as f32;
-    assert!(mean(&losses[650..]) < 0.3 * mean(&losses[..20]), "the loss fell from {} to {}", mean(&losses[..20]), mean(&losses[650..]));
+    assert!(
+        mean(&losses[650..]) < 0.3 * mean(&losses[..20]),
+        "the loss fell from {} to {}",
+        mean(&losses[..20]),
+        mean(&losses[650..])
+    );
 
     let device = Device::flex();
     let checkpoint = Checkpoint::load(&folder.path().join("checkpoint.safetensors"), &device).unwrap();
-    let source =
-        Generated { config: config.data.object.clone(), depths: config.depths(), seed: config.seed.wrapping_mul(1 << 32) };
+    let source = Generated {
+        config: config.data.object.clone(),
+        depths: config.depths(),
+        seed: config.seed.wrapping_mul(1 << 32),
+    };
     let object = source.object(0).unwrap();
     let (inputs, unseen) = object.views.split_at(4);
     let clouds = reconstruct(&checkpoint, inputs, &config.sample, &[5, 6], &device, |_| {}).unwrap();

@@ -8,7 +8,9 @@ use std::{
     },
 };
 
-use freerange_data::{GaussianSource, GenerateConfig, Shards, contact_sheet, generate_shards, inspect, measure_quality};
+use freerange_data::{
+    GaussianSource, GenerateConfig, Shards, contact_sheet, generate_shards, inspect, measure_quality,
+};
 use freerange_flow::config::TrainConfig;
 
 use crate::{error::CliError, progress::Progress};
@@ -135,13 +137,23 @@ fn look(args: &Inspect) -> Result<(), CliError> {
         println!("{}", serde_json::to_string_pretty(&report).map_err(CliError::input)?);
         return Ok(());
     }
-    println!("{} objects in {} shards, {:.1} MB, {}", report.objects, report.shards, report.bytes as f64 / 1e6, match report.complete {
-        true => "complete",
-        false => "unfinished",
-    });
+    println!(
+        "{} objects in {} shards, {:.1} MB, {}",
+        report.objects,
+        report.shards,
+        report.bytes as f64 / 1e6,
+        match report.complete {
+            true => "complete",
+            false => "unfinished",
+        }
+    );
     println!("depths {:?}, views per object {:?}, image size {:?}", report.depths, report.views, report.image_size);
     println!("licence {}, configuration {}", report.licence, report.config_sha256);
-    println!("failed objects: {}; checksums {}", report.failures.len(), if args.verify { "compared" } else { "not compared" });
+    println!(
+        "failed objects: {}; checksums {}",
+        report.failures.len(),
+        if args.verify { "compared" } else { "not compared" }
+    );
     for (depth, n) in &report.statistics {
         println!("depth {depth}: channel, mean, standard deviation");
         for (name, (mean, std)) in report.channels.iter().zip(n.mean.iter().zip(&n.std)) {
@@ -167,7 +179,10 @@ fn quality(args: &QualityArgs) -> Result<(), CliError> {
         println!("{}", serde_json::to_string_pretty(&table).map_err(CliError::input)?);
         return Ok(());
     }
-    println!("{} objects; PSNR in dB over {} held-out views each; seconds of one thread per object", args.objects, args.held_out);
+    println!(
+        "{} objects; PSNR in dB over {} held-out views each; seconds of one thread per object",
+        args.objects, args.held_out
+    );
     for row in &table {
         let psnr: Vec<String> = row.psnr.iter().map(|(d, p)| format!("depth {d}: {p:.2}")).collect();
         let s = row.seconds;

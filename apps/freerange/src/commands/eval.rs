@@ -41,6 +41,12 @@ pub struct Args {
     /// What to measure.
     #[arg(long, value_enum, default_value = "model")]
     method: Method,
+    /// Iterations of `--method fit`.
+    #[arg(long, default_value_t = 2000)]
+    fit_iterations: usize,
+    /// Longest side, in pixels, of the images that `--method fit` works on.
+    #[arg(long, default_value_t = 256)]
+    fit_size: u32,
     #[command(flatten)]
     sampling: Sampling,
     /// Write the first validation views beside their renders into this folder, one picture per object.
@@ -113,7 +119,8 @@ pub fn run(args: &Args) -> Result<(), CliError> {
             (None, _) => Cloud::default(),
         };
         let seconds = begin.elapsed().as_secs_f64();
-        let scores = score(&cloud, &validation)?.ok_or_else(|| CliError::input(format!("{name}: no validation views")))?;
+        let scores =
+            score(&cloud, &validation)?.ok_or_else(|| CliError::input(format!("{name}: no validation views")))?;
         if !args.json {
             println!("{name:40} PSNR {:6.2}  SSIM {:.4}  {:6.1} s", scores.psnr, scores.ssim, seconds);
         }
@@ -146,7 +153,12 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     }
     match args.json {
         true => println!("{json}"),
-        false => println!("{:40} PSNR {:6.2}  SSIM {:.4}", format!("mean of {}", report.objects.len()), report.psnr, report.ssim),
+        false => println!(
+            "{:40} PSNR {:6.2}  SSIM {:.4}",
+            format!("mean of {}", report.objects.len()),
+            report.psnr,
+            report.ssim
+        ),
     }
     Ok(())
 }
@@ -183,7 +195,12 @@ fn views_of(path: &Path) -> Result<Vec<View>, CliError> {
 /// What a user without a model would do: fit the Gaussians to the input images.
 fn fit_alone(inputs: &[View], args: &Args) -> Result<Cloud, CliError> {
     let (frame, canonical) = pipeline::to_canonical(inputs, args.sampling.up())?;
-    let config = FitConfig { seed: args.sampling.seed, ..FitConfig::default() };
+    let config = FitConfig {
+        iterations: args.fit_iterations,
+        render_size: Some(args.fit_size),
+        seed: args.sampling.seed,
+        ..FitConfig::default()
+    };
     let mut bar = Progress::new("fitting", config.iterations as u64);
     let cloud = fit(&canonical, None, &config, |p| {
         bar.at(p.step as u64, &format!("loss {:.4}", p.loss));

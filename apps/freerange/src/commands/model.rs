@@ -81,7 +81,10 @@ fn info(args: &Info) -> Result<(), CliError> {
     println!("{:28} {:>14}", "trained", info.trainable);
     println!("{:28} {:>14}", "frozen", info.frozen);
     let w = info.workload;
-    println!("\n{} sample(s), {} views of {} px, {} Gaussians: {} tokens", w.batch, w.views, model.image_size, w.gaussians, info.tokens);
+    println!(
+        "\n{} sample(s), {} views of {} px, {} Gaussians: {} tokens",
+        w.batch, w.views, model.image_size, w.gaussians, info.tokens
+    );
     println!("encoding the images  {:10.3} TFLOP", info.encoder_flops / 1e12);
     println!("one forward pass     {:10.3} TFLOP (a training step about three times that)", info.forward_flops / 1e12);
     let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);

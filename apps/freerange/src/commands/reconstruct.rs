@@ -242,8 +242,12 @@ fn print(report: &Report, output: &std::path::Path) {
     }
     let total: f64 = report.seconds.iter().map(|s| s.1).sum();
     let parts: Vec<String> = report.seconds.iter().map(|(name, s)| format!("{name} {s:.1}")).collect();
-    println!("{total:.1} s ({}), peak memory {}", parts.join(", "), match report.peak_memory_bytes {
-        Some(bytes) => format!("{:.0} MiB", bytes as f64 / f64::from(1 << 20)),
-        None => "unknown".into(),
-    });
+    println!(
+        "{total:.1} s ({}), peak memory {}",
+        parts.join(", "),
+        match report.peak_memory_bytes {
+            Some(bytes) => format!("{:.0} MiB", bytes as f64 / f64::from(1 << 20)),
+            None => "unknown".into(),
+        }
+    );
 }

@@ -50,7 +50,10 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         let report = trainer.step()?;
         let line = serde_json::to_string(&report).map_err(CliError::input)?;
         writeln!(log, "{line}").map_err(|e| CliError::file(&path, e))?;
-        bar.at(report.step, &format!("loss {:.3} flow {:.3} held {:.4} {:.2} s", report.loss, report.flow, report.held, report.seconds));
+        bar.at(
+            report.step,
+            &format!("loss {:.3} flow {:.3} held {:.4} {:.2} s", report.loss, report.flow, report.held, report.seconds),
+        );
         let out_of_time = args.minutes.is_some_and(|m| begin.elapsed().as_secs_f64() > 60.0 * m);
         if report.step % args.save_every == 0 || report.step == total || out_of_time {
             log.flush().map_err(|e| CliError::file(&path, e))?;
