@@ -150,7 +150,7 @@ impl Default for RefineConfig {
             opacity_regularizer: 0.0,
             scale_limit: 2.0,
             background: Background::Random,
-            render_size: Some(256),
+            render_size: Some(128),
             seed: 0,
         }
     }

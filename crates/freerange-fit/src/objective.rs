@@ -2,7 +2,7 @@
 
 use crate::{FitError, views::Targets};
 use freerange_metrics::photometric_loss;
-use freerange_raster::{RasterConfig, render, render_backward};
+use freerange_raster::{render, render_backward};
 use freerange_splat::{Cloud, channel};
 use rayon::prelude::*;
 
@@ -22,7 +22,7 @@ impl Objective {
         lambda_ssim: f64,
     ) -> Result<Self, FitError> {
         let cameras: Vec<_> = chosen.iter().map(|&i| targets.cameras[i]).collect();
-        let output = render(cloud.rows(), &cameras, &vec![background; chosen.len()], &RasterConfig::default())?;
+        let output = render(cloud.rows(), &cameras, &vec![background; chosen.len()], &targets.raster)?;
         let (width, height) = (targets.width, targets.height);
         let parts: Vec<(f64, Vec<f32>)> = output
             .rgb

@@ -2,6 +2,7 @@
 
 use crate::{Background, FitError};
 use freerange_camera::{Camera, View, image_ops};
+use freerange_raster::RasterConfig;
 use glam::{DMat3, DVec3};
 use image::RgbaImage;
 use rand::Rng;
@@ -14,6 +15,8 @@ pub(crate) struct Targets {
     pub images: Vec<RgbaImage>,
     pub width: usize,
     pub height: usize,
+    /// For renders that are compared with the (shrunk) images.
+    pub raster: RasterConfig,
 }
 
 fn refuse<T>(view: &View, field: &'static str, expected: String, found: String) -> Result<T, FitError> {
@@ -74,6 +77,7 @@ impl Targets {
             images: views.par_iter().map(|v| image_ops::resize_area(&v.image, width, height)).collect(),
             width: width as usize,
             height: height as usize,
+            raster: RasterConfig::default().shrunk(width as f32 / first.image.width() as f32),
         })
     }
 

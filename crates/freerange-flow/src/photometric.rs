@@ -52,13 +52,6 @@ pub struct Photometric {
 /// Image width, in pixels, at which the rasteriser's screen-space blur means what it does in a viewer.
 const VIEWER_WIDTH: f32 = 512.0;
 
-/// The rasteriser for images of `width` pixels that stand for larger ones: its blur, a constant number of pixels,
-/// shrinks with them. Else Gaussians that look right on small images would be too thin on large ones.
-fn raster_for(width: usize) -> RasterConfig {
-    let full = RasterConfig::default();
-    RasterConfig { blur: full.blur * (width as f32 / VIEWER_WIDTH).min(1.0).powi(2), ..full }
-}
-
 impl Photometric {
     /// For Gaussians normalised by `normalization`, on `device`.
     pub fn new(normalization: &Normalization, device: &Device) -> Self {
@@ -75,7 +68,7 @@ impl Photometric {
     /// for each object. Returns `[b]`.
     pub fn l1(&self, normalized: Tensor<3>, targets: &Targets) -> Result<Tensor<1>, FlowError> {
         let gaussians = self.denormalize(normalized);
-        let raster = raster_for(targets.images.dims()[3]);
+        let raster = RasterConfig::default().shrunk(targets.images.dims()[3] as f32 / VIEWER_WIDTH);
         let render = rasterize(gaussians, &targets.cameras, &targets.backgrounds, &raster)?; // [b, v, h, w, 4]
         let [b, v, h, w, _] = render.dims();
         let difference = render.narrow(4, 0, 3) - targets.images.clone();

@@ -21,6 +21,10 @@ use crate::{
 pub struct SampleConfig {
     /// Euler steps from noise to data.
     pub steps: usize,
+    /// Make `2^depth` Gaussians; left out: as many as at the depth the model was trained at. Tokens carry no position,
+    /// so that any number can be drawn, but sizes are those of the trained depth.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub depth: Option<u32>,
     /// Classifier-free guidance scale s: `z_u + s (z_c - z_u)`. 1 switches it off (and halves the work).
     pub guidance: f32,
     /// Photometric guidance scale lambda_PG. 0 switches it off.
@@ -39,6 +43,7 @@ impl Default for SampleConfig {
     fn default() -> Self {
         Self {
             steps: 50,
+            depth: None,
             guidance: 2.0,
             photometric: 50.0,
             gradient_at: GradientAt::Noisy,
@@ -57,6 +62,9 @@ impl SampleConfig {
         };
         if !(1..=10_000).contains(&self.steps) {
             return bad("steps", "1 to 10000", self.steps.to_string());
+        }
+        if self.depth.is_some_and(|d| !(1..=20).contains(&d)) {
+            return bad("depth", "1 to 20", format!("{:?}", self.depth));
         }
         if !self.guidance.is_finite() || self.guidance < 0.0 {
             return bad("guidance", "a finite number, 0 or more", self.guidance.to_string());
@@ -160,7 +168,7 @@ pub fn reconstruct(
 ) -> Result<Vec<Cloud>, FlowError> {
     config.validate()?;
     let model = &checkpoint.model;
-    let (b, n) = (seeds.len(), 1usize << checkpoint.depth);
+    let (b, n) = (seeds.len(), 1usize << config.depth.unwrap_or(checkpoint.depth));
     let objects: Vec<Vec<&View>> = vec![views.iter().collect()];
 
     // The images are encoded once; every sample and step shares the tokens.
@@ -172,17 +180,17 @@ pub fn reconstruct(
     let rms = Tensor::<1>::from_floats(checkpoint.gradient_rms, device).reshape([1, 1, channel::COUNT]);
     let small: Vec<View> = views.iter().map(|v| shrink(v, config.gradient_size)).collect();
     let small: Vec<Vec<&View>> = vec![small.iter().collect(); b];
-    let mut rng = ChaCha8Rng::seed_from_u64(seeds.first().copied().unwrap_or(0));
-    let backgrounds: Vec<[f32; 3]> = (0..config.steps).map(|_| config.background.draw(&mut rng)).collect();
-    let targets = |index: usize| Targets::new(&small, &vec![backgrounds[index]; b], device);
-
+    // Everything random about a sample comes from its own seed, whatever else is in the batch.
     let mut noise = Vec::with_capacity(b * n * channel::COUNT);
+    let mut backgrounds = vec![Vec::with_capacity(b); config.steps]; // [steps][b]
     for &seed in seeds {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut one: Vec<f32> = (0..n * channel::COUNT).map(|_| StandardNormal.sample(&mut rng)).collect();
         config.coupling.group(&mut one);
         noise.extend(one);
+        backgrounds.iter_mut().for_each(|step| step.push(config.background.draw(&mut rng)));
     }
+    let targets = |index: usize| Targets::new(&small, &backgrounds[index], device);
     let noise = Tensor::from_data(TensorData::new(noise, [b, n, channel::COUNT]), device);
 
     let mut previous: Option<Tensor<3>> = None;

@@ -71,7 +71,6 @@ pub struct Trainer {
     optimizer: ModuleOptimizer,
     progress: Progress,
     photometric: Photometric,
-    source: Arc<dyn ObjectSource>,
     stream: Stream,
     window: VecDeque<Arc<Object>>,
     folder: PathBuf,
@@ -150,7 +149,7 @@ impl Trainer {
         };
 
         let first = state.step * config.data.fresh as u64;
-        let mut stream = Stream::start(source.clone(), first, config.data.workers);
+        let mut stream = Stream::start(source, first, config.data.workers);
         progress(&format!("filling the window with {} objects", config.data.window));
         let window = (0..config.data.window).map(|_| Ok(Arc::new(stream.take_next()?)));
         let window = window.collect::<Result<VecDeque<_>, FlowError>>()?;
@@ -162,7 +161,6 @@ impl Trainer {
             average,
             optimizer,
             progress: state,
-            source,
             stream,
             window,
             folder: folder.into(),
@@ -324,11 +322,6 @@ impl Trainer {
             left -= steps;
             sum + steps * stage.batch as u64
         })
-    }
-
-    /// The source of objects, for checks on objects that training has not seen.
-    pub fn source(&self) -> &Arc<dyn ObjectSource> {
-        &self.source
     }
 }
 

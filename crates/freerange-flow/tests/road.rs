@@ -128,7 +128,8 @@ fn one_object_is_learned_sampled_and_rendered() {
         );
     }
     let again = reconstruct(&checkpoint, inputs, &config.sample, &[5], &device, |_| {}).unwrap();
-    assert_eq!(again[0].len(), clouds[0].len(), "the same seed on its own");
+    let worst = again[0].rows().iter().zip(clouds[0].rows()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    assert!(worst < 1e-2, "the same seed on its own gives the same sample, up to rounding: off by {worst}");
 }
 
 #[test]

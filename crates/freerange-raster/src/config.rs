@@ -16,3 +16,11 @@ impl Default for RasterConfig {
         Self { near: 0.01, far: 1e10, blur: 0.3, depth: false }
     }
 }
+
+impl RasterConfig {
+    /// For images that stand for larger ones, `ratio` (0..1) being the small width over the large: the blur, a constant
+    /// number of pixels, shrinks with them. Else Gaussians that look right on small images are too thin on large ones.
+    pub fn shrunk(self, ratio: f32) -> Self {
+        Self { blur: self.blur * ratio.min(1.0).powi(2), ..self }
+    }
+}

@@ -45,7 +45,7 @@ pub struct Args {
     #[arg(long, default_value_t = 2000)]
     fit_iterations: usize,
     /// Longest side, in pixels, of the images that `--method fit` works on.
-    #[arg(long, default_value_t = 256)]
+    #[arg(long, default_value_t = 128)]
     fit_size: u32,
     #[command(flatten)]
     sampling: Sampling,
@@ -90,6 +90,9 @@ struct ObjectReport {
     seconds: f64,
     validation: Scores,
     input_views: Option<Scores>,
+    /// The same without refinement, where there was one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    validation_before_refinement: Option<Scores>,
 }
 
 /// Runs the command.
@@ -108,11 +111,15 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         let inputs = Scene::load(inputs)?.inputs;
         let validation = views_of(validation)?;
         let begin = Instant::now();
+        let mut plain = None;
         let cloud = match (&checkpoint, args.method) {
             (Some(checkpoint), _) => {
                 let options = args.sampling.options(checkpoint, 1)?;
                 let result = pipeline::run(&inputs, checkpoint, &options, &device)?;
                 let first = result.samples.first().ok_or_else(|| CliError::input("no sample was drawn"))?;
+                if options.refine > 0 {
+                    plain = Some(to_user(&first.plain, &result.frame.canonical_from_user));
+                }
                 to_user(&first.refined, &result.frame.canonical_from_user)
             }
             (None, Method::Fit) => fit_alone(&inputs, args)?,
@@ -121,8 +128,11 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         let seconds = begin.elapsed().as_secs_f64();
         let scores =
             score(&cloud, &validation)?.ok_or_else(|| CliError::input(format!("{name}: no validation views")))?;
+        let before = plain.map(|plain| score(&plain, &validation)).transpose()?.flatten();
         if !args.json {
-            println!("{name:40} PSNR {:6.2}  SSIM {:.4}  {:6.1} s", scores.psnr, scores.ssim, seconds);
+            let before =
+                before.as_ref().map_or_else(String::new, |b| format!("  (PSNR {:.2} before refinement)", b.psnr));
+            println!("{name:40} PSNR {:6.2}  SSIM {:.4}  {:6.1} s{before}", scores.psnr, scores.ssim, seconds);
         }
         if let Some(folder) = &args.pictures {
             let path = folder.join(format!("{name}.png"));
@@ -134,6 +144,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
             seconds,
             input_views: score(&cloud, &inputs)?,
             validation: scores,
+            validation_before_refinement: before,
         });
     }
     let mean = |f: fn(&ObjectReport) -> f64| objects.iter().map(f).sum::<f64>() / objects.len() as f64;

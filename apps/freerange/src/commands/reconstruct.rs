@@ -54,6 +54,9 @@ pub struct Sampling {
     /// Euler steps from noise to Gaussians [default: the checkpoint's].
     #[arg(long)]
     pub steps: Option<usize>,
+    /// Make 2^DEPTH Gaussians [default: the depth of the level-of-detail tree that the checkpoint was trained at].
+    #[arg(long, value_parser = clap::value_parser!(u32).range(4..=16))]
+    pub depth: Option<u32>,
     /// Classifier-free guidance scale s; 1 is none [default: the checkpoint's].
     #[arg(long)]
     pub guidance: Option<f32>,
@@ -97,6 +100,7 @@ impl Sampling {
             None => SampleConfig::default(),
         };
         sample.steps = self.steps.unwrap_or(sample.steps);
+        sample.depth = self.depth.or(sample.depth);
         sample.guidance = self.guidance.unwrap_or(sample.guidance);
         sample.photometric = self.photometric.unwrap_or(sample.photometric);
         sample.validate()?;
