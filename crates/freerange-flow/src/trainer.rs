@@ -88,6 +88,9 @@ impl Trainer {
         mut progress: impl FnMut(&str),
     ) -> Result<Self, FlowError> {
         config.validate()?;
+        if let Some(checkpoint) = initial {
+            require_same_model(&config.model, &checkpoint.config)?;
+        }
         std::fs::create_dir_all(folder).map_err(|source| FlowError::Io { path: folder.into(), source })?;
         check_same_run(&config, folder)?;
         let plain = device.clone().inner();
@@ -340,6 +343,19 @@ fn measure(source: &dyn ObjectSource, count: u64, depth: u32) -> Result<Normaliz
     let mut all = Statistics::default();
     parts.iter().for_each(|p| all.merge(p));
     Ok(all.normalization().map_err(freerange_data::DataError::from)?)
+}
+
+/// Weights fit only the architecture they were trained in; the image size may differ.
+fn require_same_model(model: &ModelConfig, given: &ModelConfig) -> Result<(), FlowError> {
+    let given = ModelConfig { image_size: model.image_size, ..given.clone() };
+    if given == *model {
+        return Ok(());
+    }
+    Err(FlowError::Config {
+        field: "model".into(),
+        expected: format!("the architecture of the initial checkpoint, {given:?}"),
+        found: format!("{model:?}"),
+    })
 }
 
 /// A run's folder holds its configuration: going on with another one would mix two runs.

@@ -157,3 +157,15 @@ fn another_configuration_in_the_same_folder_is_refused() {
     let e = Trainer::open(other, folder.path(), None, &Device::flex(), |_| {}).err().expect("refused").to_string();
     assert!(e.contains("another configuration"), "{e}");
 }
+
+#[test]
+fn an_initial_checkpoint_of_another_architecture_is_refused() {
+    let (first, second) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    train(&config(1), first.path(), 1);
+    let device = Device::flex();
+    let checkpoint = Checkpoint::load(&first.path().join("checkpoint.safetensors"), &device).unwrap();
+    let mut other = config(1);
+    other.model.hidden = 32;
+    let e = Trainer::open(other, second.path(), Some(&checkpoint), &device, |_| {}).err().expect("refused").to_string();
+    assert!(e.contains("architecture"), "{e}");
+}
