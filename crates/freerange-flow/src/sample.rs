@@ -151,16 +151,13 @@ pub fn classifier_free(conditional: Tensor<3>, unconditional: Tensor<3>, scale: 
     unconditional.clone() + (conditional - unconditional).mul_scalar(scale)
 }
 
-/// One object to reconstruct: its posed images, in the canonical frame.
-pub type PosedImages<'a> = &'a [View];
-
 /// Draws one sample of Gaussians per seed that fits the posed images. The whole of Section 3.5.
 ///
 /// `views` are in the canonical frame (object within radius 0.5 of the origin); so are the results. Samples of several
 /// seeds run as one batch. `progress` is told each step before it is taken.
 pub fn reconstruct(
     checkpoint: &Checkpoint,
-    views: PosedImages,
+    views: &[View],
     config: &SampleConfig,
     seeds: &[u64],
     device: &Device,
