@@ -61,6 +61,7 @@ input_errors!(
     freerange_camera::CameraError,
     freerange_data::DataError,
     freerange_fit::FitError,
+    freerange_mesh::MeshError,
     freerange_metrics::MetricsError,
     freerange_model::ModelError,
     freerange_raster::RasterError,

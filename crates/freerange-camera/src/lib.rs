@@ -14,5 +14,5 @@ pub use camera::{Camera, View};
 pub use error::{CameraError, Place};
 pub use frame::{CanonicalFrame, FrameConfig, Similarity, Up, canonical_from_user};
 pub use plucker::{PatchLayout, plucker};
-pub use scene::{Scene, load_cameras};
+pub use scene::{Scene, load_cameras, transforms_json};
 pub use selection::{SelectionConfig, ViewSets, k_means, select_views};

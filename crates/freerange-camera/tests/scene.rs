@@ -1,6 +1,6 @@
 //! Loading scenes, good and broken.
 
-use freerange_camera::{Camera, CameraError, Scene, load_cameras};
+use freerange_camera::{Camera, CameraError, Scene, load_cameras, transforms_json};
 use glam::{DMat4, DVec3};
 use image::{DynamicImage, ImageBuffer, Rgb, RgbImage, Rgba, RgbaImage};
 use proptest::prelude::*;
@@ -451,5 +451,28 @@ proptest! {
         if let Err(error) = files.load(&description()) {
             prop_assert!(error.to_string().contains("frame 1"), "{}", error);
         }
+    }
+}
+
+#[test]
+fn written_cameras_are_read_back() {
+    let folder = tempfile::tempdir().unwrap();
+    let camera = |i: usize| {
+        let c = Camera::look_at(eye(i), DVec3::new(0.1, 0.0, -0.1), DVec3::Z, 0.7 + 0.1 * i as f64, 40, 30);
+        Camera { cx: 18.5, cy: 16.25, fy: c.fx * 1.1, ..c }
+    };
+    let frames: Vec<(String, Camera)> = (0..3).map(|i| (format!("images/{i:03}.png"), camera(i))).collect();
+    let path = folder.path().join("transforms.json");
+    std::fs::write(&path, transforms_json(&frames)).unwrap();
+    let found = load_cameras(&path).unwrap();
+    assert_eq!(found.len(), 3);
+    for ((name, found), (path, expected)) in found.iter().zip(&frames) {
+        assert!(path.contains(name.as_str()), "{name}");
+        let numbers = |c: &Camera| [c.fx, c.fy, c.cx, c.cy];
+        for (a, b) in numbers(found).iter().zip(numbers(expected)) {
+            assert!((a - b).abs() < 1e-9, "{a} {b}");
+        }
+        assert_eq!((found.width, found.height), (40, 30));
+        assert!(found.world_to_camera.abs_diff_eq(expected.world_to_camera, 1e-9));
     }
 }

@@ -39,6 +39,14 @@ pub enum DataError {
         /// The reason.
         source: std::io::Error,
     },
+    /// A place for shards that cannot be used.
+    #[error("{location}: {problem}")]
+    Store {
+        /// The place, as it was given.
+        location: String,
+        /// What is wrong.
+        problem: String,
+    },
     /// An object in a shard is not what it should be.
     #[error("{}: object {sample}, entry {entry}: expected {expected}, found {found}", shard.display())]
     Sample {
@@ -59,6 +67,9 @@ pub enum DataError {
         /// Number of the object.
         index: u64,
     },
+    /// The choice of views.
+    #[error(transparent)]
+    Camera(#[from] freerange_camera::CameraError),
     /// The Gaussians or their tree.
     #[error(transparent)]
     Splat(#[from] freerange_splat::SplatError),

@@ -1,25 +1,29 @@
 //! Looking at a folder of shards or any other source of objects.
 
 use std::collections::BTreeMap;
-use std::path::Path;
 
-use freerange_splat::{Normalization, channel};
+use freerange_splat::{Cloud, Normalization, channel};
 use image::{Rgb, RgbImage, RgbaImage};
 use rayon::prelude::*;
 
-use crate::file::sha256_of_file;
+use crate::items::{Input, count};
 use crate::manifest::{Failure, Manifest};
 use crate::quality::{over_white, render_over_white};
-use crate::shards::open_all;
-use crate::{DataError, Object, ObjectSource};
+use crate::shards::{check_size, read_object};
+use crate::store::{Store, sha256};
+use crate::{DataError, Object};
 
 /// What [`inspect`] finds in a folder.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
 pub struct Report {
     /// Whether every object that was asked for has been dealt with.
     pub complete: bool,
+    /// What the objects are made of.
+    pub input: Input,
     /// Objects in the shards.
     pub objects: u64,
+    /// Of these, names of those that are flagged as bad fits.
+    pub flagged: Vec<String>,
     /// Objects that could not be made.
     pub failures: Vec<Failure>,
     /// Shards.
@@ -28,15 +32,21 @@ pub struct Report {
     pub bytes: u64,
     /// Depths of the slices.
     pub depths: Vec<u32>,
-    /// Fewest and most views of an object; `None` without objects.
-    pub views: Option<[usize; 2]>,
+    /// Objects per part of the data.
+    pub splits: BTreeMap<String, u64>,
+    /// Objects per licence.
+    pub licences: BTreeMap<String, u64>,
+    /// Least, median and largest PSNR in dB of the Gaussians before the tree; `None` where not measured.
+    pub psnr: Option<[f64; 3]>,
+    /// Number of views of the first object; `None` without objects.
+    pub views: Option<usize>,
     /// Width and height of the first object's views, in pixels; `None` without objects.
     pub image_size: Option<[u32; 2]>,
-    /// Licence of the objects, as an SPDX identifier.
-    pub licence: String,
-    /// SHA-256 of the configuration.
-    pub config_sha256: String,
-    /// By depth, mean and standard deviation of each channel.
+    /// Whether the first object has sets of views for evaluation; `None` without objects.
+    pub evaluation: Option<bool>,
+    /// SHA-256 of what the folder is made with.
+    pub plan_sha256: String,
+    /// By depth, mean and standard deviation of each channel over the objects for training.
     pub statistics: BTreeMap<u32, Normalization>,
     /// Names of the channels.
     pub channels: [&'static str; channel::COUNT],
@@ -44,47 +54,64 @@ pub struct Report {
     pub verified: bool,
 }
 
-/// Looks at a folder of shards. With `verify`, reads all of it.
+/// Looks at what [`build`](crate::build) made, also while it is unfinished. With `verify`, reads all of it.
 ///
 /// # Errors
-/// As [`Shards::open`](crate::Shards::open), but folders may be unfinished; with `verify` also for contents that are
-/// not those of the manifest.
-pub fn inspect(folder: &Path, verify: bool) -> Result<Report, DataError> {
-    let manifest = Manifest::load(folder)?;
-    let shards = open_all(&manifest, folder)?;
+/// [`DataError::File`] where something is not what the manifest says; [`DataError::Sample`] for broken objects;
+/// [`DataError::Io`].
+pub fn inspect(store: &Store, verify: bool) -> Result<Report, DataError> {
+    let manifest = Manifest::load(store)?;
+    let depths = &manifest.plan.config.depths;
+    for shard in &manifest.shards {
+        check_size(store, &shard.name(), shard.bytes)?;
+    }
     if verify {
-        manifest.shards.par_iter().zip(&shards).try_for_each(|(record, shard)| {
-            let path = folder.join(&record.name);
-            let found = sha256_of_file(&path)?;
-            if found != record.sha256 {
-                let problem = format!("expected SHA-256 {} as in the manifest, found {found}", record.sha256);
-                return Err(DataError::File { path, problem });
+        manifest.shards.iter().try_for_each(|shard| {
+            let name = shard.name();
+            let whole = store.range(&name, 0, shard.bytes)?;
+            let found = sha256(&whole);
+            if found != shard.sha256 {
+                let problem = format!("expected SHA-256 {} as in the manifest, found {found}", shard.sha256);
+                return Err(DataError::File { path: store.path(&name), problem });
             }
-            (0..shard.len()).into_par_iter().try_for_each(|i| {
-                shard.metadata(i)?;
-                shard.read(i, &manifest.config.depths).map(|_| ())
+            drop(whole);
+            shard.objects.par_iter().try_for_each(|object| {
+                let entries = read_object(store, &name, object)?;
+                entries.metadata()?;
+                entries.leaves()?;
+                entries.object(depths).map(|_| ())
             })
         })?;
     }
-    let first = shards.iter().find(|s| !s.is_empty()).map(|s| s.read(0, &[])).transpose()?;
-    let views = || shards.iter().flat_map(|s| s.view_counts());
+    let first = manifest.shards.iter().find_map(|s| Some((s.name(), s.objects.first()?)));
+    let first = first.map(|(name, object)| read_object(store, &name, object)).transpose()?;
+    let object = first.as_ref().map(|f| f.object(&[])).transpose()?;
+    let metadata = first.as_ref().map(|f| f.metadata()).transpose()?;
     let mut statistics = BTreeMap::new();
-    for &depth in &manifest.config.depths {
+    for &depth in depths {
         if let Some(s) = manifest.statistics(depth).filter(|s| s.count() > 0) {
             statistics.insert(depth, s.normalization()?);
         }
     }
+    let mut psnr: Vec<f64> = manifest.objects().filter_map(|o| o.psnr).collect();
+    psnr.sort_unstable_by(f64::total_cmp);
+    let at = |i: usize| psnr.get(i).copied();
     Ok(Report {
         complete: manifest.is_complete(),
-        objects: manifest.samples(),
+        input: manifest.plan.input.clone(),
+        objects: manifest.objects().count() as u64,
+        flagged: manifest.objects().filter(|o| o.flagged).map(|o| o.id.clone()).collect(),
         failures: manifest.shards.iter().flat_map(|s| s.failures.iter().cloned()).collect(),
         shards: manifest.shards.len() as u64,
         bytes: manifest.bytes(),
-        depths: manifest.config.depths.clone(),
-        views: views().min().zip(views().max()).map(|(a, b)| [a, b]),
-        image_size: first.and_then(|o| o.views.first().map(|v| [v.camera.width, v.camera.height])),
-        licence: manifest.config.licence.clone(),
-        config_sha256: manifest.config_sha256.clone(),
+        depths: depths.clone(),
+        splits: count(manifest.objects().map(|o| format!("{:?}", o.split).to_lowercase())),
+        licences: count(manifest.objects().map(|o| o.licence.clone())),
+        psnr: at(0).zip(at(psnr.len() / 2)).zip(psnr.last()).map(|((a, b), &c)| [a, b, c]),
+        views: object.as_ref().map(|o| o.views.len()),
+        image_size: object.and_then(|o| o.views.first().map(|v| [v.camera.width, v.camera.height])),
+        evaluation: metadata.map(|m| m.evaluation.is_some()),
+        plan_sha256: manifest.plan_sha256.clone(),
         statistics,
         channels: channel::NAMES,
         verified: verify,
@@ -96,12 +123,17 @@ const GAP: u32 = 2;
 /// Largest side of a contact sheet, in pixels.
 const MAX_SHEET: u64 = 16384;
 
-/// The first `count` objects of `source` on one white sheet, `columns` of them side by side. Each is a row of pictures in
-/// front of white: two views, then, as seen from the first view, the coarsest, the middle and the finest slice.
+/// Objects on one white sheet, `columns` of them side by side. Each is a row of pictures in front of white: two views,
+/// then, as seen from the first view, the coarsest, the middle and the finest slice, then, where they are given, the
+/// Gaussians before the tree.
 ///
 /// # Errors
-/// [`DataError::Config`] for a sheet of no or too many pixels; the source's errors.
-pub fn contact_sheet(source: &dyn ObjectSource, count: u64, columns: u64) -> Result<RgbaImage, DataError> {
+/// [`DataError::Config`] for a sheet of no or too many pixels; the errors of `objects`.
+pub fn contact_sheet(
+    objects: impl ExactSizeIterator<Item = Result<(Object, Option<Cloud>), DataError>>,
+    columns: u64,
+) -> Result<RgbaImage, DataError> {
+    let count = objects.len() as u64;
     let refused = |found: String| DataError::Config {
         field: "contact sheet".into(),
         expected: format!("at least one object and column, and at most {MAX_SHEET} pixels either way"),
@@ -110,21 +142,28 @@ pub fn contact_sheet(source: &dyn ObjectSource, count: u64, columns: u64) -> Res
     if count == 0 || columns == 0 {
         return Err(refused(format!("{count} objects in {columns} columns")));
     }
-    let first = pictures(&source.object(0)?)?;
-    let (w, h) = first[0].dimensions();
     let columns = columns.min(count);
-    let cell = [first.len() as u64 * u64::from(w + GAP) + u64::from(GAP), u64::from(h + GAP)];
-    let [width, height] = [columns.saturating_mul(cell[0]), count.div_ceil(columns).saturating_mul(cell[1])];
-    if width > MAX_SHEET || height > MAX_SHEET {
-        return Err(refused(format!("{width} x {height} pixels")));
-    }
-    let mut sheet = RgbaImage::from_pixel(width as u32, height as u32, image::Rgba([255; 4]));
+    let mut sheet = RgbaImage::default();
+    let mut cell = [0; 2];
+    let mut per_object = 0;
     // One object after the other, so that memory does not grow with their number.
-    for i in 0..count {
+    for (i, object) in (0..).zip(objects) {
+        let (object, leaves) = object?;
+        let pictures = pictures(&object, leaves.as_ref())?;
+        if i == 0 {
+            let (w, h) = pictures[0].dimensions();
+            per_object = pictures.len();
+            cell = [per_object as u64 * u64::from(w + GAP) + u64::from(GAP), u64::from(h + GAP)];
+            let [width, height] = [columns.saturating_mul(cell[0]), count.div_ceil(columns).saturating_mul(cell[1])];
+            if width > MAX_SHEET || height > MAX_SHEET {
+                return Err(refused(format!("{width} x {height} pixels")));
+            }
+            sheet = RgbaImage::from_pixel(width as u32, height as u32, image::Rgba([255; 4]));
+        }
         let (x, y) = (i % columns * cell[0], i / columns * cell[1]);
-        for (k, picture) in pictures(&source.object(i)?)?.into_iter().take(first.len()).enumerate() {
+        for (k, picture) in pictures.into_iter().take(per_object).enumerate() {
+            let x = x + k as u64 * u64::from(picture.width() + GAP);
             let picture = image::DynamicImage::ImageRgb8(picture).into_rgba8();
-            let x = x + k as u64 * u64::from(w + GAP);
             image::imageops::replace(&mut sheet, &picture, x as i64, y as i64);
         }
     }
@@ -132,7 +171,7 @@ pub fn contact_sheet(source: &dyn ObjectSource, count: u64, columns: u64) -> Res
 }
 
 /// The pictures of an object on a contact sheet, at least one.
-fn pictures(object: &Object) -> Result<Vec<RgbImage>, DataError> {
+fn pictures(object: &Object, leaves: Option<&Cloud>) -> Result<Vec<RgbImage>, DataError> {
     let depths: Vec<u32> = object.slices.keys().copied().collect();
     let no = |what: &str| DataError::Config {
         field: format!("object {}", object.id),
@@ -141,14 +180,18 @@ fn pictures(object: &Object) -> Result<Vec<RgbImage>, DataError> {
     };
     let camera = object.views.first().ok_or_else(|| no("view"))?.camera;
     let (coarse, fine) = depths.first().zip(depths.last()).ok_or_else(|| no("slice"))?;
+    let [w, h] = [camera.width, camera.height];
     // Objects of one source have as many pictures each, also where two of these are the same.
     let second = object.views.len().div_ceil(2).min(object.views.len() - 1);
     let mut pictures = vec![
-        picture(&over_white(&object.views[0].image), camera.width, camera.height),
-        picture(&over_white(&object.views[second].image), camera.width, camera.height),
+        picture(&over_white(&object.views[0].image), w, h),
+        picture(&over_white(&object.views[second].image), w, h),
     ];
     for &depth in [coarse, &depths[depths.len() / 2], fine] {
-        pictures.push(picture(&render_over_white(object.slice(depth)?, &camera)?, camera.width, camera.height));
+        pictures.push(picture(&render_over_white(object.slice(depth)?, &camera)?, w, h));
+    }
+    if let Some(leaves) = leaves {
+        pictures.push(picture(&render_over_white(leaves, &camera)?, w, h));
     }
     Ok(pictures)
 }

@@ -1,157 +1,117 @@
-//! How well slices show their object, and what making objects costs.
+//! How well Gaussians show an object, before and after the tree.
 
-use std::collections::BTreeMap;
-use std::ops::Range;
 use std::time::Instant;
 
 use freerange_camera::{Camera, View};
-use freerange_mesh::{Scene, generate, orbit_cameras, render};
+use freerange_fit::FitConfig;
 use freerange_metrics::psnr;
 use freerange_raster::RasterConfig;
 use freerange_splat::{Cloud, LodTree};
 use image::RgbaImage;
-use rand::SeedableRng;
-use rand_chacha::ChaCha8Rng;
 
+use crate::build::{mesh_of, seed_of};
 use crate::fitted::{fitted_gaussians, polished};
-use crate::{DataError, GaussianSource, ObjectConfig, surface_gaussians};
+use crate::items::Item;
+use crate::object::{Photographed, Seconds, lap};
+use crate::validate::check;
+use crate::{BuildConfig, DataError, ObjectConfig, SurfaceConfig, surface_gaussians};
 
-/// PSNR in dB that a perfect image is given, so that means stay finite.
+/// Renders that agree to the last bit would have infinite PSNR; this keeps means finite.
 const BEST_PSNR: f64 = 100.0;
 
-/// Quality and cost of one way to make Gaussians.
+/// How well Gaussians show an object: PSNR in dB over held-out views, over white.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
 pub struct Quality {
-    /// The way.
-    pub gaussians: GaussianSource,
-    /// Objects measured.
-    pub objects: u64,
-    /// By depth, PSNR in dB against views that the Gaussians were not made from: mean over objects.
-    pub psnr: BTreeMap<u32, f64>,
-    /// The same of the worst object.
-    pub worst: BTreeMap<u32, f64>,
-    /// Mean seconds per object.
-    pub seconds: Seconds,
+    /// The object.
+    pub id: String,
+    /// Triangles of its mesh.
+    pub triangles: usize,
+    /// Number of Gaussians of the fit that the tree is made of.
+    pub gaussians: usize,
+    /// PSNR of that fit.
+    pub full: f64,
+    /// Seconds of that fit.
+    pub full_seconds: f64,
+    /// The same for fewer Gaussians.
+    pub by_count: Vec<CountQuality>,
 }
 
-/// Seconds of one thread by stage.
-#[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize)]
-pub struct Seconds {
-    /// Mesh, ray structure, baked light.
-    pub scene: f64,
-    /// All views of the object.
-    pub views: f64,
-    /// Surface points or fit.
-    pub gaussians: f64,
-    /// Level-of-detail tree, slices, and their polishing.
-    pub slices: f64,
+/// How well a number of Gaussians shows an object. PSNR in dB.
+#[derive(Clone, Debug, PartialEq, serde::Serialize)]
+pub struct CountQuality {
+    /// The number.
+    pub gaussians: usize,
+    /// A fit of so many.
+    pub fit: f64,
+    /// Seconds of that fit.
+    pub fit_seconds: f64,
+    /// The tree's slice of the full fit.
+    pub slice: f64,
+    /// That slice after some gradient steps; `None` where none were asked for.
+    pub polished: Option<f64>,
+    /// The slice of a tree over points on the surface, as many as the full fit has Gaussians.
+    pub surface: f64,
 }
 
-/// Measures the ways `sources` on the objects of `seeds`, made as [`Object::generate`](crate::Object::generate) does,
-/// with slices at `depths`. Every object is rendered from `held_out` further views in front of white, at the views' own
-/// resolution. Objects come one after the other, so that seconds mean something; `progress` hears of each.
+/// Fits an object with the configured number of Gaussians and with each of `counts`, and compares fits with slices.
 ///
 /// # Errors
-/// [`DataError::Config`] if there is nothing to measure; whatever making an object can say.
-pub fn measure_quality(
-    config: &ObjectConfig,
-    sources: &[GaussianSource],
-    seeds: Range<u64>,
-    depths: &[u32],
-    held_out: usize,
-    mut progress: impl FnMut(u64, GaussianSource),
-) -> Result<Vec<Quality>, DataError> {
-    if seeds.is_empty() || depths.is_empty() || held_out == 0 {
-        return Err(DataError::Config {
-            field: "quality".into(),
-            expected: "at least one object, depth and held-out view".into(),
-            found: format!("seeds {seeds:?}, depths {depths:?}, {held_out} views"),
-        });
-    }
+/// [`DataError::Config`] for counts that are no powers of two or exceed the full fit's; what making an object may say.
+pub fn measure_quality(item: &Item, config: &BuildConfig, counts: &[usize]) -> Result<Quality, DataError> {
     config.validate()?;
-    let objects = seeds.end - seeds.start;
-    sources
-        .iter()
-        .map(|&gaussians| {
-            let config = ObjectConfig { gaussians, ..config.clone() };
-            let mut seconds = Seconds::default();
-            let mut psnr: BTreeMap<u32, f64> = depths.iter().map(|&d| (d, 0.0)).collect();
-            let mut worst: BTreeMap<u32, f64> = depths.iter().map(|&d| (d, BEST_PSNR)).collect();
-            for seed in seeds.clone() {
-                let (slices, views) = slices_and_held_out_views(&config, seed, depths, held_out, &mut seconds)?;
-                for (depth, db) in slice_psnr(&slices, &views)? {
-                    *psnr.entry(depth).or_default() += db / objects as f64;
-                    worst.entry(depth).and_modify(|w| *w = w.min(db));
-                }
-                progress(seed, gaussians);
-            }
-            for stage in [&mut seconds.scene, &mut seconds.views, &mut seconds.gaussians, &mut seconds.slices] {
-                *stage /= objects as f64;
-            }
-            Ok(Quality { gaussians, objects, psnr, worst, seconds })
-        })
-        .collect()
-}
+    let most = config.object.fit.max_gaussians;
+    let fine = |n: &usize| n.is_power_of_two() && *n <= most;
+    check(counts.iter().all(fine), "counts", &format!("powers of two up to fit.max_gaussians = {most}"), counts)?;
+    check(config.shard.held_out > 0, "held_out", "at least 1 to measure", config.shard.held_out)?;
+    let (mesh, _) = mesh_of(item, config)?;
+    let seed = seed_of(item, config);
+    let triangles = mesh.triangles.len();
+    let object = &config.object;
+    let mut shot = Photographed::new(mesh, seed, object, config.shard.held_out, &mut Seconds::default())?;
 
-/// Object `seed` stage by stage, and views of it that its Gaussians were not made from.
-fn slices_and_held_out_views(
-    config: &ObjectConfig,
-    seed: u64,
-    depths: &[u32],
-    held_out: usize,
-    seconds: &mut Seconds,
-) -> Result<(BTreeMap<u32, Cloud>, Vec<View>), DataError> {
-    // The same draws as for training, so that these are the very objects.
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    rng.set_stream(1);
-    let start = Instant::now();
-    let scene = Scene::new(generate(seed, &config.generator)?, &config.lighting.sample(&mut rng))?;
-    lap(&mut seconds.scene, start);
-
-    let start = Instant::now();
-    let views = photograph(&scene, orbit_cameras(config.views, &mut rng, &config.cameras), config.samples_per_axis);
-    lap(&mut seconds.views, start);
-
-    let start = Instant::now();
-    let leaves = match config.gaussians {
-        GaussianSource::Surface => surface_gaussians(&scene, &config.surface, &mut rng),
-        GaussianSource::Fit => fitted_gaussians(&scene, &views, config, &mut rng)?,
+    let timed = |shot: &mut Photographed, fit: FitConfig| -> Result<(Cloud, f64, f64), DataError> {
+        let start = Instant::now();
+        let cloud = fitted_gaussians(shot, &ObjectConfig { fit, ..object.clone() })?;
+        let mut seconds = 0.0;
+        lap(&mut seconds, start);
+        let db = psnr_over_white(&cloud, &shot.held_out)?;
+        Ok((cloud, db, seconds))
     };
-    lap(&mut seconds.gaussians, start);
-
-    let start = Instant::now();
-    let tree = LodTree::build_to_depth(&leaves, depths.iter().copied().max().unwrap_or(0), config.alignment)?;
-    let slice = |&depth: &u32| Ok((depth, polished(tree.slice(depth)?, &views, config.polish, seed)?));
-    let slices = depths.iter().map(slice).collect::<Result<_, DataError>>()?;
-    lap(&mut seconds.slices, start);
-
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    rng.set_stream(2);
-    let held_out = orbit_cameras(held_out, &mut rng, &config.cameras);
-    Ok((slices, photograph(&scene, held_out, config.samples_per_axis)))
-}
-
-fn lap(stage: &mut f64, start: Instant) {
-    *stage += start.elapsed().as_secs_f64();
-}
-
-fn photograph(scene: &Scene, cameras: Vec<Camera>, samples_per_axis: u32) -> Vec<View> {
-    let view = |(i, camera)| View { name: format!("{i:03}"), image: render(scene, &camera, samples_per_axis), camera };
-    cameras.into_iter().enumerate().map(view).collect()
-}
-
-/// PSNR in dB of renders of `slices` against `views`, in front of white: mean over the views.
-pub(crate) fn slice_psnr(slices: &BTreeMap<u32, Cloud>, views: &[View]) -> Result<BTreeMap<u32, f64>, DataError> {
-    slices
-        .iter()
-        .map(|(&depth, cloud)| {
-            let mut sum = 0.0;
-            for view in views {
-                sum += psnr(&render_over_white(cloud, &view.camera)?, &over_white(&view.image))?.min(BEST_PSNR);
-            }
-            Ok((depth, sum / views.len() as f64))
+    let (full_cloud, full, full_seconds) = timed(&mut shot, object.fit.clone())?;
+    let deepest = counts.iter().max().map_or(0, |n| n.ilog2());
+    let tree = LodTree::build_to_depth(&full_cloud, deepest, object.alignment)?;
+    let points = SurfaceConfig { points: full_cloud.len(), ..object.surface.clone() };
+    let surface = surface_gaussians(&shot.scene, &points, &mut shot.rng);
+    let surface = LodTree::build_to_depth(&surface, deepest, object.alignment)?;
+    let by_count = counts.iter().map(|&gaussians| {
+        let fit =
+            FitConfig { max_gaussians: gaussians, initial: object.fit.initial.min(gaussians), ..object.fit.clone() };
+        let (_, fit, fit_seconds) = timed(&mut shot, fit)?;
+        let slice = tree.slice(gaussians.ilog2())?;
+        let polished = match object.polish {
+            0 => None,
+            steps => Some(psnr_over_white(&polished(slice.clone(), &shot.views, steps, seed)?, &shot.held_out)?),
+        };
+        Ok(CountQuality {
+            gaussians,
+            fit,
+            fit_seconds,
+            slice: psnr_over_white(&slice, &shot.held_out)?,
+            polished,
+            surface: psnr_over_white(&surface.slice(gaussians.ilog2())?, &shot.held_out)?,
         })
-        .collect()
+    });
+    let by_count = by_count.collect::<Result<_, DataError>>()?;
+    Ok(Quality { id: item.id.clone(), triangles, gaussians: full_cloud.len(), full, full_seconds, by_count })
+}
+
+/// PSNR in dB of renders of `cloud` against `views`, in front of white: mean over the views.
+pub(crate) fn psnr_over_white(cloud: &Cloud, views: &[View]) -> Result<f64, DataError> {
+    let mut sum = 0.0;
+    for view in views {
+        sum += psnr(&render_over_white(cloud, &view.camera)?, &over_white(&view.image))?.min(BEST_PSNR);
+    }
+    Ok(sum / views.len() as f64)
 }
 
 /// `cloud` in front of white, clamped to 0..1, sRGB-encoded. `[h, w, 3]`
@@ -172,38 +132,32 @@ pub(crate) fn over_white(image: &RgbaImage) -> Vec<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Object, tests::tiny_config};
-
-    /// The stages here repeat those of `Object::generate`; this keeps the two together.
-    #[test]
-    fn measures_the_objects_of_training() {
-        let mut config = tiny_config();
-        config.surface.points = 64;
-        let object = Object::generate(5, &config, &[4, 6]).unwrap();
-        let (slices, views) = slices_and_held_out_views(&config, 5, &[4, 6], 3, &mut Seconds::default()).unwrap();
-        assert_eq!(slices, object.slices);
-        assert_eq!(views.len(), 3);
-        assert!(views.iter().all(|v| object.views.iter().all(|o| o.camera != v.camera)));
-    }
+    use crate::Items;
+    use crate::tests::{tiny_config, write_ball};
 
     #[test]
-    fn finer_slices_are_better_and_both_ways_work() {
-        let mut config = tiny_config();
-        config.surface.points = 512;
-        config.cameras.resolution = 64;
-        config.fit.iterations = 20;
-        config.fit.initial = 200;
-        config.fit.max_gaussians = 512;
-        let sources = [GaussianSource::Surface, GaussianSource::Fit];
-        let mut heard = 0;
-        let found = measure_quality(&config, &sources, 0..2, &[1, 8], 2, |_, _| heard += 1).unwrap();
-        assert_eq!((found.len(), heard), (2, 4));
-        for q in &found {
-            assert!(q.psnr[&8] > q.psnr[&1] + 1.0, "{q:?}");
-            assert!(q.worst[&8] <= q.psnr[&8]);
-            assert!(q.seconds.scene > 0.0 && q.seconds.views > 0.0 && q.seconds.gaussians > 0.0);
+    fn more_gaussians_are_better_and_all_ways_are_measured() {
+        let mut config = BuildConfig { object: tiny_config(), ..BuildConfig::default() };
+        config.object.cameras.resolution = 64;
+        config.object.views = 12;
+        config.object.fit.iterations = 100;
+        config.object.fit.initial = 1024;
+        config.object.fit.max_gaussians = 1024;
+        config.object.polish = 20;
+        let folder = tempfile::tempdir().unwrap();
+        write_ball(&folder.path().join("ball.ply"));
+        let item = Items::find(folder.path(), "", "CC0-1.0").unwrap().get(0).unwrap();
+        let q = measure_quality(&item, &config, &[16, 512]).unwrap();
+        assert_eq!((q.id.as_str(), q.gaussians, q.by_count.len()), ("ball", 1024, 2));
+        let [few, many] = [&q.by_count[0], &q.by_count[1]];
+        assert!(many.fit > few.fit + 1.0 && many.slice > few.slice + 1.0 && many.surface > few.surface + 1.0, "{q:?}");
+        assert!(q.full > few.fit + 1.0 && few.polished.unwrap() > few.slice, "{q:?}");
+        assert!(q.full_seconds > 0.0 && many.fit_seconds > 0.0 && q.triangles > 0);
+        for bad in [&[3usize][..], &[2048]] {
+            assert!(measure_quality(&item, &config, bad).unwrap_err().to_string().contains("powers of two"));
         }
-        assert!(measure_quality(&config, &sources, 0..0, &[2], 2, |_, _| {}).is_err());
+        config.shard.held_out = 0;
+        assert!(measure_quality(&item, &config, &[16]).unwrap_err().to_string().contains("held_out"));
     }
 
     #[test]

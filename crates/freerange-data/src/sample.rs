@@ -4,20 +4,21 @@
 //! |---|---|
 //! | `KEY.json` | [`Metadata`] |
 //! | `KEY.cameras.json` | name, size, intrinsics and pose of every view; see [`CAMERAS`] |
-//! | `KEY.gaussians.safetensors` | `depth_08` f32 `[256, 14]`, ...: the slices, channels as in [`freerange_splat::channel`] |
-//! | `KEY.000.png`, ... | the views, 8-bit RGBA with straight alpha, in the order of the cameras |
+//! | `KEY.gaussians.safetensors` | `depth_08` f32 `[256, 14]`, ...: the slices, channels as in [`freerange_splat::channel`]; `leaves` f32 `[n, 14]`, where they are kept: the Gaussians before the tree |
+//! | `KEY.000.webp`, ... | the views, 8-bit RGBA with straight alpha, in the order of the cameras; or `KEY.000.png`, ... |
 
 use std::collections::BTreeMap;
 use std::io::Cursor;
 use std::path::Path;
 
-use freerange_camera::{Camera, View};
+use freerange_camera::{Camera, View, ViewSets};
 use freerange_splat::{Cloud, channel};
 use glam::{DMat3, DMat4, DVec4};
-use image::{ColorType, DynamicImage, ImageDecoder, ImageFormat, RgbaImage, codecs::png::PngDecoder};
+use image::codecs::{png::PngDecoder, webp::WebPDecoder};
+use image::{ColorType, DynamicImage, ImageDecoder, ImageResult, RgbaImage};
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 
-use crate::{DataError, Object};
+use crate::{DataError, HeldOutPsnr, ImageFormat, Object, Split};
 
 /// Ends of the names of an object's entries but its views.
 pub(crate) const METADATA: &str = "json";
@@ -43,13 +44,24 @@ pub struct Metadata {
     pub source: String,
     /// Licence of the object, as an SPDX identifier.
     pub licence: String,
-    /// Seed it was made from.
+    /// SHA-256 of the mesh file; `None` for a generated object.
+    pub file_sha256: Option<String>,
+    /// What was ignored or repaired when the mesh was read.
+    pub notes: Vec<String>,
+    /// Seed of what was drawn for it.
     pub seed: u64,
-    /// SHA-256 of the configuration it was made with.
-    pub config_sha256: String,
-    /// By depth, PSNR in dB of the slice's renders against views that its Gaussians were not fitted to; empty where
-    /// not measured.
-    pub psnr: BTreeMap<u32, f64>,
+    /// SHA-256 of what the folder was made with.
+    pub plan_sha256: String,
+    /// The part of the data it belongs to.
+    pub split: Split,
+    /// Number of Gaussians before the tree.
+    pub gaussians: u64,
+    /// How well Gaussians show it; `None` where not measured.
+    pub psnr: Option<HeldOutPsnr>,
+    /// Whether the Gaussians are too bad to train on.
+    pub flagged: bool,
+    /// The views that evaluation gives to a model, and those that it scores, by number; `None` where there are too few.
+    pub evaluation: Option<ViewSets>,
 }
 
 /// `KEY.cameras.json`. Axes are OpenCV's (x right, y down, z forward), the world is the canonical frame (+z up, object
@@ -102,9 +114,12 @@ impl Place<'_> {
 }
 
 /// Name of the entry of view `i`, without the key.
-pub(crate) fn view_entry(i: usize) -> String {
-    format!("{i:03}.png")
+pub(crate) fn view_entry(i: usize, format: ImageFormat) -> String {
+    format!("{i:03}.{}", format.ending())
 }
+
+/// Name of the tensor of the Gaussians before the tree.
+const LEAVES: &str = "leaves";
 
 fn tensor_name(depth: u32) -> String {
     format!("depth_{depth:02}")
@@ -117,7 +132,13 @@ pub(crate) fn is_key(key: &str) -> bool {
 
 /// The entries of an object in the order of a shard: what follows `KEY.` in the name, and the bytes.
 /// `shard` is for messages only. Refuses whatever [`Shards`](crate::Shards) would refuse to read.
-pub(crate) fn encode(object: &Object, metadata: &Metadata, shard: &Path) -> Result<Vec<(String, Vec<u8>)>, DataError> {
+pub(crate) fn encode(
+    object: &Object,
+    leaves: Option<&Cloud>,
+    metadata: &Metadata,
+    format: ImageFormat,
+    shard: &Path,
+) -> Result<Vec<(String, Vec<u8>)>, DataError> {
     let place = Place { shard, sample: &object.id, entry: METADATA };
     if !is_key(&object.id) || metadata.id != object.id {
         return Err(place.error("an id of 1 to 64 characters A-Z a-z 0-9 - _", format!("{:?}", metadata.id)));
@@ -136,10 +157,10 @@ pub(crate) fn encode(object: &Object, metadata: &Metadata, shard: &Path) -> Resu
     let mut entries = vec![
         (METADATA.into(), json(METADATA, serde_json::to_vec_pretty(metadata))?),
         (CAMERAS.into(), json(CAMERAS, serde_json::to_vec(&cameras))?),
-        (GAUSSIANS.into(), encode_slices(&object.slices, place.of(GAUSSIANS))?),
+        (GAUSSIANS.into(), encode_gaussians(&object.slices, leaves, place.of(GAUSSIANS))?),
     ];
     for (i, view) in object.views.iter().enumerate() {
-        let name = view_entry(i);
+        let name = view_entry(i, format);
         let size = (view.camera.width, view.camera.height);
         if view.image.dimensions() != size {
             let (w, h) = view.image.dimensions();
@@ -147,25 +168,33 @@ pub(crate) fn encode(object: &Object, metadata: &Metadata, shard: &Path) -> Resu
                 .of(&name)
                 .error(format!("the camera's {} x {} pixels", size.0, size.1), format!("{w} x {h}")));
         }
-        let mut png = Cursor::new(Vec::new());
+        let mut file = Cursor::new(Vec::new());
+        let as_format = match format {
+            ImageFormat::Png => image::ImageFormat::Png,
+            ImageFormat::Webp => image::ImageFormat::WebP, // lossless
+        };
         view.image
-            .write_to(&mut png, ImageFormat::Png)
-            .map_err(|e| place.of(&name).error("an image PNG can hold", e))?;
-        entries.push((name, png.into_inner()));
+            .write_to(&mut file, as_format)
+            .map_err(|e| place.of(&name).error("an image the format can hold", e))?;
+        entries.push((name, file.into_inner()));
     }
     Ok(entries)
 }
 
-fn encode_slices(slices: &BTreeMap<u32, Cloud>, place: Place) -> Result<Vec<u8>, DataError> {
-    let mut tensors = Vec::with_capacity(slices.len());
+fn encode_gaussians(slices: &BTreeMap<u32, Cloud>, leaves: Option<&Cloud>, place: Place) -> Result<Vec<u8>, DataError> {
+    let bytes_of = |cloud: &Cloud| -> Vec<u8> { cloud.rows().iter().flat_map(|v| v.to_le_bytes()).collect() };
+    let mut tensors = Vec::with_capacity(slices.len() + 1);
     for (&depth, cloud) in slices {
         if depth > MAX_DEPTH || cloud.len() != 1 << depth {
             let expected = format!("2^depth Gaussians at depths up to {MAX_DEPTH}");
             return Err(place.error(expected, format!("{} at depth {depth}", cloud.len())));
         }
         cloud.check_finite()?;
-        let bytes: Vec<u8> = cloud.rows().iter().flat_map(|v| v.to_le_bytes()).collect();
-        tensors.push((tensor_name(depth), cloud.len(), bytes));
+        tensors.push((tensor_name(depth), cloud.len(), bytes_of(cloud)));
+    }
+    if let Some(leaves) = leaves {
+        leaves.check_finite()?;
+        tensors.push((LEAVES.into(), leaves.len(), bytes_of(leaves)));
     }
     let view = |n: usize, bytes| TensorView::new(Dtype::F32, vec![n, channel::COUNT], bytes);
     let refused = |e| place.error("tensors safetensors can hold", e);
@@ -239,18 +268,38 @@ fn check_cameras(cameras: &[Camera], place: Place) -> Result<(), DataError> {
     Ok(())
 }
 
-/// `KEY.000.png` of `camera`'s size.
-pub(crate) fn decode_view(bytes: &[u8], name: String, camera: Camera, place: Place) -> Result<View, DataError> {
-    let broken = |e| place.error("a PNG file", e);
-    let decoder = PngDecoder::new(Cursor::new(bytes)).map_err(broken)?;
-    // Before decoding: a few bytes of PNG can claim gigabytes of pixels.
-    if decoder.dimensions() != (camera.width, camera.height) || decoder.color_type() != ColorType::Rgba8 {
-        let expected = format!("{} x {} pixels of Rgba8", camera.width, camera.height);
-        let (w, h) = decoder.dimensions();
-        return Err(place.error(expected, format!("{w} x {h} of {:?}", decoder.color_type())));
-    }
-    let image: RgbaImage = DynamicImage::from_decoder(decoder).map_err(broken)?.into_rgba8();
+/// `KEY.000.webp` or `KEY.000.png` of `camera`'s size.
+pub(crate) fn decode_view(
+    bytes: &[u8],
+    format: ImageFormat,
+    name: String,
+    camera: Camera,
+    place: Place,
+) -> Result<View, DataError> {
+    let reader = Cursor::new(bytes);
+    let image = match format {
+        ImageFormat::Png => pixels(PngDecoder::new(reader), &camera, "a PNG file", place)?,
+        ImageFormat::Webp => pixels(WebPDecoder::new(reader), &camera, "a WebP file", place)?,
+    };
     Ok(View { name, camera, image })
+}
+
+fn pixels(
+    decoder: ImageResult<impl ImageDecoder>,
+    camera: &Camera,
+    kind: &str,
+    place: Place,
+) -> Result<RgbaImage, DataError> {
+    let broken = |e| place.error(kind, e);
+    let decoder = decoder.map_err(broken)?;
+    // Before decoding: a few bytes can claim gigabytes of pixels.
+    // Without a transparent pixel, a WebP file may come as RGB.
+    let (size, color) = (decoder.dimensions(), decoder.color_type());
+    if size != (camera.width, camera.height) || !matches!(color, ColorType::Rgba8 | ColorType::Rgb8) {
+        let expected = format!("{} x {} pixels of 8-bit RGB(A)", camera.width, camera.height);
+        return Err(place.error(expected, format!("{} x {} of {color:?}", size.0, size.1)));
+    }
+    Ok(DynamicImage::from_decoder(decoder).map_err(broken)?.into_rgba8())
 }
 
 /// Of `KEY.gaussians.safetensors` the slices at `depths`.
@@ -265,17 +314,30 @@ pub(crate) fn decode_slices(bytes: &[u8], depths: &[u32], place: Place) -> Resul
                 expected: depth,
                 found: depths_in(&tensors),
             })?;
-            let shape = [1usize << depth.min(MAX_DEPTH), channel::COUNT];
-            if tensor.dtype() != Dtype::F32 || tensor.shape() != shape {
-                let found = format!("{:?} {:?}", tensor.dtype(), tensor.shape());
-                return Err(place.error(format!("tensor {name} of F32 {shape:?}"), found));
-            }
-            let values = tensor.data().as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b));
-            let cloud = Cloud::from_rows(values.collect());
-            cloud.check_finite().map_err(|e| place.error(format!("finite numbers in tensor {name}"), e))?;
+            let cloud = cloud(&tensor, &name, Some(1usize << depth.min(MAX_DEPTH)), place)?;
             Ok((depth, cloud))
         })
         .collect()
+}
+
+/// Of `KEY.gaussians.safetensors` the Gaussians before the tree, where they are kept.
+pub(crate) fn decode_leaves(bytes: &[u8], place: Place) -> Result<Option<Cloud>, DataError> {
+    let tensors = SafeTensors::deserialize(bytes).map_err(|e| place.error("a safetensors file", e))?;
+    tensors.tensor(LEAVES).ok().map(|tensor| cloud(&tensor, LEAVES, None, place)).transpose()
+}
+
+/// A tensor `[rows, 14]` of finite f32; any number of rows where none is given.
+fn cloud(tensor: &TensorView, name: &str, rows: Option<usize>, place: Place) -> Result<Cloud, DataError> {
+    let fits = matches!(tensor.shape(), &[n, channel::COUNT] if rows.is_none_or(|rows| rows == n));
+    if tensor.dtype() != Dtype::F32 || !fits {
+        let found = format!("{:?} {:?}", tensor.dtype(), tensor.shape());
+        let rows = rows.map_or("n".into(), |n| n.to_string());
+        return Err(place.error(format!("tensor {name} of F32 [{rows}, {}]", channel::COUNT), found));
+    }
+    let values = tensor.data().as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b));
+    let cloud = Cloud::from_rows(values.collect());
+    cloud.check_finite().map_err(|e| place.error(format!("finite numbers in tensor {name}"), e))?;
+    Ok(cloud)
 }
 
 fn depths_in(tensors: &SafeTensors) -> Vec<u32> {

@@ -1,18 +1,19 @@
 //! A folder of shards as a source of training objects.
 
-use std::path::Path;
-
+use freerange_splat::{Cloud, Statistics};
 use rand::{SeedableRng, seq::SliceRandom};
 use rand_chacha::ChaCha8Rng;
-use rayon::prelude::*;
 
-use crate::manifest::Manifest;
-use crate::shard::ShardReader;
-use crate::{DataError, Metadata, Object, ObjectSource};
+use crate::manifest::{Manifest, ObjectRecord};
+use crate::shard::ObjectBytes;
+use crate::store::Store;
+use crate::{DataError, Metadata, Object, ObjectSource, Split};
 
-/// The objects of a folder in a shuffled order, over and over.
+/// The objects of one part of a folder of shards in a shuffled order, over and over.
+///
+/// One read per object, of just its bytes: from a local folder as from far away.
 pub struct Shards {
-    shards: Vec<ShardReader>,
+    store: Store,
     order: Vec<(u32, u32)>, // (shard, object in it)
     depths: Vec<u32>,
     manifest: Manifest,
@@ -25,33 +26,41 @@ impl std::fmt::Debug for Shards {
 }
 
 impl Shards {
-    /// Opens a folder made by [`generate_shards`](crate::generate_shards). Objects will have slices at `depths`.
+    /// Opens what [`build`](crate::build) made. Objects will have slices at `depths`. Flagged objects are left out.
+    /// `split`: `None` takes all parts.
     ///
     /// # Errors
-    /// [`DataError::File`] where the folder lacks a depth, is unfinished or empty, or where a shard is not the one of
-    /// the manifest; [`DataError::Sample`] where a shard is broken; [`DataError::Io`].
-    pub fn open(folder: &Path, depths: &[u32]) -> Result<Self, DataError> {
-        let manifest = Manifest::load(folder)?;
-        let problem = |problem: String| DataError::File { path: folder.into(), problem };
-        if let Some(depth) = depths.iter().find(|d| !manifest.config.depths.contains(d)) {
-            let found = &manifest.config.depths;
+    /// [`DataError::File`] where the folder lacks a depth, is unfinished or empty, or where a local shard is not the one
+    /// of the manifest; [`DataError::Io`].
+    pub fn open(store: &Store, depths: &[u32], split: Option<Split>) -> Result<Self, DataError> {
+        let manifest = Manifest::load(store)?;
+        let problem = |problem: String| DataError::File { path: store.path(""), problem };
+        let found = &manifest.plan.config.depths;
+        if let Some(depth) = depths.iter().find(|d| !found.contains(d)) {
             return Err(problem(format!("expected Gaussians at depth {depth}, found depths {found:?}")));
         }
         if !manifest.is_complete() {
-            let (found, expected) = (manifest.shards.len(), manifest.config.shard_count());
+            let (found, expected) = (manifest.shards.len(), manifest.plan.shard_count());
             return Err(problem(format!("expected {expected} shards, found {found}: let their making finish first")));
         }
-        if manifest.samples() == 0 {
-            return Err(problem("expected objects, found none".into()));
+        // Local ones only: asking for the size of thousands of remote files takes minutes.
+        if store.folder().is_some() {
+            for shard in &manifest.shards {
+                check_size(store, &shard.name(), shard.bytes)?;
+            }
         }
-        let shards = open_all(&manifest, folder)?;
-        let mut order: Vec<(u32, u32)> = shards
-            .iter()
-            .enumerate()
-            .flat_map(|(s, shard)| (0..shard.len()).map(move |i| (s as u32, i as u32)))
-            .collect();
-        order.shuffle(&mut ChaCha8Rng::seed_from_u64(manifest.config.seed));
-        Ok(Self { shards, order, depths: depths.to_vec(), manifest })
+        let wanted = |o: &ObjectRecord| !o.flagged && split.is_none_or(|s| s == o.split);
+        let mut order: Vec<(u32, u32)> = Vec::new();
+        for (s, shard) in manifest.shards.iter().enumerate() {
+            let objects = shard.objects.iter().enumerate().filter(|(_, o)| wanted(o));
+            order.extend(objects.map(|(i, _)| (s as u32, i as u32)));
+        }
+        if order.is_empty() {
+            let part = split.map_or("any part".into(), |s| format!("part {s:?}"));
+            return Err(problem(format!("expected objects in {part} that are not flagged, found none")));
+        }
+        order.shuffle(&mut ChaCha8Rng::seed_from_u64(manifest.plan.config.seed));
+        Ok(Self { store: store.clone(), order, depths: depths.to_vec(), manifest })
     }
 
     /// Number of different objects.
@@ -69,46 +78,68 @@ impl Shards {
         &self.manifest
     }
 
+    /// Bytes of object number `index` in its shard.
+    pub fn object_size(&self, index: u64) -> u64 {
+        self.locate(index).1.bytes
+    }
+
     /// What is known of object number `index` besides its views and Gaussians.
     ///
     /// # Errors
     /// As [`object`](ObjectSource::object).
     pub fn metadata(&self, index: u64) -> Result<Metadata, DataError> {
-        let (shard, i) = self.locate(index);
-        shard.metadata(i)
+        self.bytes(index)?.metadata()
     }
 
-    fn locate(&self, index: u64) -> (&ShardReader, usize) {
+    /// The Gaussians of object number `index` before the tree, where the shards keep them.
+    ///
+    /// # Errors
+    /// As [`object`](ObjectSource::object).
+    pub fn leaves(&self, index: u64) -> Result<Option<Cloud>, DataError> {
+        self.bytes(index)?.leaves()
+    }
+
+    fn locate(&self, index: u64) -> (String, &ObjectRecord) {
         let (shard, i) = self.order[(index % self.order.len() as u64) as usize];
-        (&self.shards[shard as usize], i as usize)
+        let shard = &self.manifest.shards[shard as usize];
+        (shard.name(), &shard.objects[i as usize])
+    }
+
+    fn bytes(&self, index: u64) -> Result<ObjectBytes, DataError> {
+        let (name, object) = self.locate(index);
+        read_object(&self.store, &name, object)
     }
 }
 
 impl ObjectSource for Shards {
     fn object(&self, index: u64) -> Result<Object, DataError> {
-        let (shard, i) = self.locate(index);
-        shard.read(i, &self.depths)
+        self.bytes(index)?.object(&self.depths)
+    }
+
+    fn statistics(&self, depth: u32) -> Option<Statistics> {
+        self.manifest.statistics(depth).filter(|s| s.count() > 0)
     }
 }
 
-/// Opens the finished shards of `folder` and compares them with the manifest; not their checksums.
-pub(crate) fn open_all(manifest: &Manifest, folder: &Path) -> Result<Vec<ShardReader>, DataError> {
-    manifest
-        .shards
-        .par_iter()
-        .map(|record| {
-            let path = folder.join(&record.name);
-            let problem = |problem: String| DataError::File { path: path.clone(), problem };
-            let bytes = std::fs::metadata(&path).map_err(crate::file::io_error(&path))?.len();
-            if bytes != record.bytes {
-                return Err(problem(format!("expected {} bytes as in the manifest, found {bytes}", record.bytes)));
-            }
-            let shard = ShardReader::open(&path)?;
-            if shard.len() as u64 != record.samples {
-                let (expected, found) = (record.samples, shard.len());
-                return Err(problem(format!("expected {expected} objects as in the manifest, found {found}")));
-            }
-            Ok(shard)
-        })
-        .collect()
+/// The entries of an object of the shard `name`.
+pub(crate) fn read_object(store: &Store, name: &str, object: &ObjectRecord) -> Result<ObjectBytes, DataError> {
+    // A shard may claim anything; what objects can really have is bounded entry by entry.
+    const MAX: u64 = 4 << 30;
+    if object.bytes > MAX {
+        let problem = format!("object {}: expected at most {MAX} bytes, found {}", object.id, object.bytes);
+        return Err(DataError::File { path: store.path(name), problem });
+    }
+    ObjectBytes::new(store.range(name, object.offset, object.bytes)?, &object.id, store.path(name))
+}
+
+/// Compares the size of a shard with its record's.
+pub(crate) fn check_size(store: &Store, name: &str, bytes: u64) -> Result<(), DataError> {
+    match store.size(name)? {
+        Some(found) if found == bytes => Ok(()),
+        found => {
+            let found = found.map_or("no such file".into(), |n| n.to_string());
+            let problem = format!("expected {bytes} bytes as in the manifest, found {found}");
+            Err(DataError::File { path: store.path(name), problem })
+        }
+    }
 }

@@ -3,6 +3,7 @@
 use std::{sync::Arc, thread};
 
 use crossbeam_channel::{Receiver, bounded};
+use freerange_splat::Statistics;
 
 use crate::{DataError, Object, ObjectConfig};
 
@@ -10,6 +11,11 @@ use crate::{DataError, Object, ObjectConfig};
 pub trait ObjectSource: Send + Sync {
     /// Object number `index`; the same one each time.
     fn object(&self, index: u64) -> Result<Object, DataError>;
+
+    /// Statistics over all its slices at `depth`, where they are known.
+    fn statistics(&self, _depth: u32) -> Option<Statistics> {
+        None
+    }
 }
 
 /// An endless source: object `index` is generated from seed `seed + index`.

@@ -1,8 +1,8 @@
 //! Everything that training needs to know, as one TOML file. `configs/tiny.toml` is a commented example.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use freerange_data::ObjectConfig;
+use freerange_data::{BuildConfig, LoadLimits, ObjectConfig, ShardConfig};
 use freerange_model::{Compute, ModelConfig};
 
 use crate::{FlowError, coupling::Coupling, path::TimeSchedule, sample::SampleConfig};
@@ -36,10 +36,17 @@ pub struct TrainConfig {
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DataConfig {
-    /// Folder of shards made by `freerange data generate`. Without it, objects are made on the fly, without end.
-    pub shards: Option<PathBuf>,
+    /// Shards made by `freerange data build`: a folder, or a URL (`s3://`, `gs://`, `https://`). Without it, objects are
+    /// generated on the fly, without end.
+    pub shards: Option<String>,
     /// How an object is made: its Gaussians, views and cameras.
     pub object: ObjectConfig,
+    /// What shards keep of each object, and how objects are divided.
+    pub shard: ShardConfig,
+    /// Depths of the slices in shards, ascending; empty: those of the stages.
+    pub depths: Vec<u32>,
+    /// What mesh files may be like.
+    pub mesh: LoadLimits,
     /// Objects held in memory, from which each batch is drawn.
     pub window: usize,
     /// Objects that leave the window, and new ones that enter it, with every step.
@@ -55,6 +62,9 @@ impl Default for DataConfig {
         Self {
             shards: None,
             object: ObjectConfig::default(),
+            shard: ShardConfig::default(),
+            depths: Vec::new(),
+            mesh: LoadLimits::default(),
             window: 64,
             fresh: 2,
             workers: 1,
@@ -178,10 +188,21 @@ pub struct Stage {
     pub steps: u64,
 }
 
+/// The configurations of the repository, which can be named without their path.
+const PRESETS: [(&str, &str); 3] = [
+    ("tiny", include_str!("../../../configs/tiny.toml")),
+    ("base", include_str!("../../../configs/base.toml")),
+    ("paper", include_str!("../../../configs/paper.toml")),
+];
+
 impl TrainConfig {
-    /// Reads and checks a configuration file.
+    /// Reads and checks a configuration: a file, or one of the repository's by its name (`tiny`, `base`, `paper`).
     pub fn load(path: &Path) -> Result<Self, FlowError> {
-        let text = std::fs::read_to_string(path).map_err(|source| FlowError::Io { path: path.into(), source })?;
+        let preset = PRESETS.iter().find(|(name, _)| path.as_os_str() == *name);
+        let text = match preset {
+            Some((_, text)) => text.to_string(),
+            None => std::fs::read_to_string(path).map_err(|source| FlowError::Io { path: path.into(), source })?,
+        };
         let config: Self =
             toml::from_str(&text).map_err(|e| FlowError::State { path: path.into(), problem: e.to_string() })?;
         config.validate()?;
@@ -211,6 +232,18 @@ impl TrainConfig {
         depths
     }
 
+    /// How shards for this training are made.
+    pub fn build_config(&self) -> BuildConfig {
+        let data = &self.data;
+        BuildConfig {
+            seed: self.seed,
+            depths: if data.depths.is_empty() { self.depths() } else { data.depths.clone() },
+            shard: data.shard.clone(),
+            object: data.object.clone(),
+            mesh: data.mesh.clone(),
+        }
+    }
+
     /// Refuses impossible values.
     pub fn validate(&self) -> Result<(), FlowError> {
         let check = |ok: bool, field: &str, expected: &str, found: String| match ok {
@@ -219,7 +252,7 @@ impl TrainConfig {
         };
         self.model.validate()?;
         self.sample.validate()?;
-        self.data.object.validate()?;
+        self.build_config().validate()?;
         check(!self.stages.is_empty(), "stage", "at least one [[stage]]", "none".into())?;
         for s in &self.stages {
             check((1..=20).contains(&s.depth), "stage.depth", "1 to 20", s.depth.to_string())?;

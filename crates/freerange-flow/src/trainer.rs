@@ -13,7 +13,7 @@ use burn::{
     store::ModuleRecord,
     tensor::{Device, Tensor},
 };
-use freerange_data::{Generated, Object, ObjectSource, Stream};
+use freerange_data::{Generated, Object, ObjectSource, Shards, Split, Store, Stream};
 use freerange_model::{Checkpoint, Compute, FreeRange, ModelConfig};
 use freerange_splat::{Normalization, Statistics, channel};
 use rand::seq::index::sample as sample_indices;
@@ -95,7 +95,7 @@ impl Trainer {
         check_same_run(&config, folder)?;
         let plain = device.clone().inner();
         let source: Arc<dyn ObjectSource> = match &config.data.shards {
-            Some(path) => Arc::new(freerange_data::Shards::open(path, &config.depths())?),
+            Some(place) => Arc::new(Shards::open(&Store::open(place)?, &config.depths(), Some(Split::Train))?),
             None => Arc::new(Generated {
                 config: config.data.object.clone(),
                 depths: config.depths(),
@@ -328,9 +328,12 @@ impl Trainer {
     }
 }
 
-/// Normalisation statistics over the first `count` objects at `depth`.
+/// Normalisation statistics at `depth`: those that the source knows, or over its first `count` objects.
 fn measure(source: &dyn ObjectSource, count: u64, depth: u32) -> Result<Normalization, FlowError> {
     use rayon::prelude::*;
+    if let Some(known) = source.statistics(depth) {
+        return Ok(known.normalization().map_err(freerange_data::DataError::from)?);
+    }
     // Partial statistics are merged in the order of the objects, so that the result does not depend on threads.
     let parts = (0..count)
         .into_par_iter()

@@ -8,15 +8,15 @@ use crate::error::{MeshError, check};
 pub enum Kind {
     /// Overlapping primitives with unrelated textures.
     Composition,
-    /// Cup or mug with a handle.
+    /// Cup, mug or tumbler.
     Mug,
-    /// Bowl, plate, dish, ramekin.
+    /// Bowl, dish, ramekin.
     Bowl,
     /// Can with a label band.
     Can,
     /// Bottle or jar with a cap, round or square.
     Bottle,
-    /// Carton with printed faces.
+    /// Carton with printed faces: boxes and gable tops.
     Carton,
     /// Frying pan or pot with handles.
     Pan,
@@ -32,6 +32,30 @@ pub enum Kind {
     Utensil,
     /// Toys, furniture, lamps: pieces stacked along z with shared materials.
     Stack,
+    /// Plate or saucer, plain, ringed or painted.
+    Plate,
+    /// Jar, vase or candle glass.
+    Jar,
+    /// Teapot, kettle or jug with spout and handle.
+    Teapot,
+    /// Lamp or candlestick.
+    Lamp,
+    /// Box with open lid or flaps.
+    OpenBox,
+    /// Book or stack of books.
+    Book,
+    /// Bag, stand-up pouch, sachet, cushion.
+    Pouch,
+    /// Squeezed tube with a cap.
+    Tube,
+    /// Animal, figure, car or shoe of smoothly joined pieces.
+    Toy,
+    /// Roll, folded towels, hat.
+    Textile,
+    /// Basket woven in relief.
+    Wicker,
+    /// Basket of wires.
+    Wire,
 }
 
 /// What is generated and how often. Weights are relative; zero leaves a family out.
@@ -64,6 +88,30 @@ pub struct GeneratorConfig {
     pub utensil: f32,
     /// Weight of [`Kind::Stack`].
     pub stack: f32,
+    /// Weight of [`Kind::Plate`].
+    pub plate: f32,
+    /// Weight of [`Kind::Jar`].
+    pub jar: f32,
+    /// Weight of [`Kind::Teapot`].
+    pub teapot: f32,
+    /// Weight of [`Kind::Lamp`].
+    pub lamp: f32,
+    /// Weight of [`Kind::OpenBox`].
+    pub open_box: f32,
+    /// Weight of [`Kind::Book`].
+    pub book: f32,
+    /// Weight of [`Kind::Pouch`].
+    pub pouch: f32,
+    /// Weight of [`Kind::Tube`].
+    pub tube: f32,
+    /// Weight of [`Kind::Toy`].
+    pub toy: f32,
+    /// Weight of [`Kind::Textile`].
+    pub textile: f32,
+    /// Weight of [`Kind::Wicker`].
+    pub wicker: f32,
+    /// Weight of [`Kind::Wire`].
+    pub wire: f32,
     /// Share of objects that stand upright (turned about z only).
     pub upright_share: f32,
     /// Share of objects that lie on a side; the rest is turned arbitrarily.
@@ -79,19 +127,31 @@ pub struct GeneratorConfig {
 impl Default for GeneratorConfig {
     fn default() -> Self {
         Self {
-            composition: 5.0,
-            mug: 1.6,
-            bowl: 1.6,
-            can: 0.9,
-            bottle: 1.4,
-            carton: 1.8,
-            pan: 0.8,
-            fruit: 1.1,
-            loaf: 0.6,
-            basket: 1.0,
-            rack: 0.5,
-            utensil: 0.8,
-            stack: 1.4,
+            composition: 3.2,
+            mug: 2.0,
+            bowl: 2.0,
+            can: 1.5,
+            bottle: 1.8,
+            carton: 2.4,
+            pan: 1.1,
+            fruit: 1.3,
+            loaf: 0.7,
+            basket: 0.6,
+            rack: 0.4,
+            utensil: 0.9,
+            stack: 0.9,
+            plate: 0.8,
+            jar: 1.1,
+            teapot: 0.8,
+            lamp: 0.4,
+            open_box: 0.5,
+            book: 0.6,
+            pouch: 0.8,
+            tube: 0.5,
+            toy: 0.9,
+            textile: 0.5,
+            wicker: 0.7,
+            wire: 0.5,
             upright_share: 0.6,
             lying_share: 0.2,
             white_share: 0.27,
@@ -103,7 +163,7 @@ impl Default for GeneratorConfig {
 
 impl GeneratorConfig {
     /// Each family with its weight.
-    pub fn weights(&self) -> [(Kind, f32); 13] {
+    pub fn weights(&self) -> [(Kind, f32); 25] {
         [
             (Kind::Composition, self.composition),
             (Kind::Mug, self.mug),
@@ -118,6 +178,18 @@ impl GeneratorConfig {
             (Kind::Rack, self.rack),
             (Kind::Utensil, self.utensil),
             (Kind::Stack, self.stack),
+            (Kind::Plate, self.plate),
+            (Kind::Jar, self.jar),
+            (Kind::Teapot, self.teapot),
+            (Kind::Lamp, self.lamp),
+            (Kind::OpenBox, self.open_box),
+            (Kind::Book, self.book),
+            (Kind::Pouch, self.pouch),
+            (Kind::Tube, self.tube),
+            (Kind::Toy, self.toy),
+            (Kind::Textile, self.textile),
+            (Kind::Wicker, self.wicker),
+            (Kind::Wire, self.wire),
         ]
     }
 
@@ -138,6 +210,18 @@ impl GeneratorConfig {
             rack: weight(Kind::Rack),
             utensil: weight(Kind::Utensil),
             stack: weight(Kind::Stack),
+            plate: weight(Kind::Plate),
+            jar: weight(Kind::Jar),
+            teapot: weight(Kind::Teapot),
+            lamp: weight(Kind::Lamp),
+            open_box: weight(Kind::OpenBox),
+            book: weight(Kind::Book),
+            pouch: weight(Kind::Pouch),
+            tube: weight(Kind::Tube),
+            toy: weight(Kind::Toy),
+            textile: weight(Kind::Textile),
+            wicker: weight(Kind::Wicker),
+            wire: weight(Kind::Wire),
             ..Self::default()
         }
     }

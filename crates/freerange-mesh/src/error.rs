@@ -21,6 +21,34 @@ pub enum MeshError {
         /// What was found.
         found: String,
     },
+    /// A file that cannot be opened or read.
+    #[error("cannot read {path}: {source}")]
+    Io {
+        /// The file.
+        path: std::path::PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// A file whose content breaks its format or a limit of [`LoadLimits`](crate::LoadLimits).
+    #[error("{path}: {field}: expected {expected}, found {found}")]
+    File {
+        /// The file.
+        path: std::path::PathBuf,
+        /// The place in the file.
+        field: String,
+        /// What is required.
+        expected: String,
+        /// What was found.
+        found: String,
+    },
+    /// A file that is well formed but needs something that is not implemented here.
+    #[error("{path}: {what} is not supported")]
+    Unsupported {
+        /// The file.
+        path: std::path::PathBuf,
+        /// What it needs, and what helps.
+        what: String,
+    },
 }
 
 /// Fails unless `ok`.

@@ -1,7 +1,7 @@
-use glam::{Quat, Vec2, Vec3};
+use glam::{Quat, Vec2, Vec3, Vec4};
 
 use crate::error::MeshError;
-use crate::texture::Material;
+use crate::texture::{AlphaMode, Material};
 
 /// A triangle mesh with materials. Vertices are split where the surface has an edge or a texture seam.
 /// Triangles are counter-clockwise seen from outside.
@@ -13,14 +13,20 @@ pub struct Mesh {
     pub normals: Vec<Vec3>,
     /// Positions before the object's final rotation, in the same unit: where solid textures are evaluated. `[vertices]`
     pub rest: Vec<Vec3>,
-    /// Surface coordinates for printed textures; (0, 0) is the lower left of the print. `[vertices]`
+    /// Surface coordinates: for pictures from files v runs down and (0, 0) is the upper left, for printed textures
+    /// v runs up and (0, 0) is the lower left. `[vertices]`
     pub uvs: Vec<Vec2>,
+    /// Linear colours and alphas, multiplied onto the base colour; may be empty for none. `[vertices]` or `[]`
+    pub colors: Vec<Vec4>,
     /// Vertex indices. `[triangles]`
     pub triangles: Vec<[u32; 3]>,
     /// Index into `materials`. `[triangles]`
     pub triangle_materials: Vec<u16>,
     /// The materials.
     pub materials: Vec<Material>,
+    /// True if every part is a closed, opaque surface that faces outwards, as those of generated objects are. Other
+    /// meshes may be open sheets, and are shaded and lit on both sides.
+    pub solid: bool,
 }
 
 impl Mesh {
@@ -57,6 +63,12 @@ impl Mesh {
         if let Some(v) = self.uvs.iter().find(|v| !v.is_finite()) {
             return fail("uvs", "finite numbers".into(), format!("{v}"));
         }
+        if !self.colors.is_empty() && self.colors.len() != n {
+            return fail("colors", format!("none, or {n} entries, one per position"), self.colors.len().to_string());
+        }
+        if let Some(v) = self.colors.iter().find(|v| !v.is_finite()) {
+            return fail("colors", "finite numbers".into(), format!("{v}"));
+        }
         Ok(())
     }
 
@@ -69,6 +81,28 @@ impl Mesh {
     pub fn area(&self, i: usize) -> f32 {
         let [a, b, c] = self.corners(i);
         0.5 * (b - a).cross(c - a).length()
+    }
+
+    /// How much of what lies behind a point of triangle `i` is hidden, within [0, 1]; `bary` weighs its second and third
+    /// corner.
+    pub(crate) fn opacity(&self, i: usize, bary: Vec2) -> f32 {
+        let material = &self.materials[usize::from(self.triangle_materials[i])];
+        if material.alpha == AlphaMode::Opaque {
+            return 1.0;
+        }
+        let corners = self.triangles[i].map(|v| v as usize);
+        let w = [1.0 - bary.x - bary.y, bary.x, bary.y];
+        let rest = (0..3).map(|k| w[k] * self.rest[corners[k]]).sum();
+        let uv = (0..3).map(|k| w[k] * self.uvs[corners[k]]).sum();
+        material.opacity(material.rgba(rest, uv, self.tint(corners, w), 0.0).w)
+    }
+
+    /// The vertex colour at a point given by its weights; white without vertex colours.
+    pub(crate) fn tint(&self, corners: [usize; 3], weights: [f32; 3]) -> Vec4 {
+        if self.colors.is_empty() {
+            return Vec4::ONE;
+        }
+        (0..3).map(|k| weights[k] * self.colors[corners[k]]).sum()
     }
 
     /// Rotates about the origin; `rest` stays.

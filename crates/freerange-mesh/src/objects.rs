@@ -13,7 +13,7 @@ use crate::noise;
 use crate::part::{Assembly, Part};
 use crate::shapes::{self, Span};
 use crate::style::{Style, unit_vector};
-use crate::{household, household_extra};
+use crate::{household, packaging, soft, vessels, woven};
 
 /// Objects with more triangles than this get no further parts.
 const MANY: usize = 7000;
@@ -29,18 +29,30 @@ pub fn generate(seed: u64, config: &GeneratorConfig) -> Result<Mesh, MeshError> 
     let a = &mut assembly;
     match kind {
         Kind::Composition => composition(a, s),
-        Kind::Mug => household::mug(a, s),
-        Kind::Bowl => household::bowl(a, s),
-        Kind::Can => household::can(a, s),
-        Kind::Bottle => household::bottle(a, s),
-        Kind::Carton => household::carton(a, s),
-        Kind::Pan => household::pan(a, s),
-        Kind::Fruit => household_extra::fruit(a, s),
-        Kind::Loaf => household_extra::loaf(a, s),
-        Kind::Basket => household_extra::basket(a, s),
-        Kind::Rack => household_extra::rack(a, s),
-        Kind::Utensil => household_extra::utensil(a, s),
-        Kind::Stack => household_extra::stack(a, s),
+        Kind::Mug => vessels::mug(a, s),
+        Kind::Bowl => vessels::bowl(a, s),
+        Kind::Plate => vessels::plate(a, s),
+        Kind::Pan => vessels::pan(a, s),
+        Kind::Teapot => vessels::teapot(a, s),
+        Kind::Jar => vessels::jar(a, s),
+        Kind::Lamp => vessels::lamp(a, s),
+        Kind::Can => packaging::can(a, s),
+        Kind::Bottle => packaging::bottle(a, s),
+        Kind::Carton => packaging::carton(a, s),
+        Kind::OpenBox => packaging::open_box(a, s),
+        Kind::Book => packaging::book(a, s),
+        Kind::Fruit => household::fruit(a, s),
+        Kind::Loaf => household::loaf(a, s),
+        Kind::Basket => household::basket(a, s),
+        Kind::Rack => household::rack(a, s),
+        Kind::Utensil => household::utensil(a, s),
+        Kind::Stack => household::stack(a, s),
+        Kind::Pouch => soft::pouch(a, s),
+        Kind::Tube => soft::tube(a, s),
+        Kind::Toy => soft::toy(a, s),
+        Kind::Textile => soft::textile(a, s),
+        Kind::Wicker => woven::wicker(a, s),
+        Kind::Wire => woven::wire(a, s),
     }
     let rotation = rotation(s);
     Ok(assembly.finish(rotation))
@@ -128,7 +140,7 @@ pub fn primitive(s: &mut Style, m: [u16; 2]) -> (Part, f32) {
         }
         16..28 => (shapes::superquadric(Vec3::ONE, 1.0, 1.0, s.count(14, 26), m[0]), 60.0),
         28..38 => {
-            let (e1, e2) = (s.log(0.25, 2.2), s.log(0.25, 2.2));
+            let (e1, e2) = (s.log(0.25, 1.7), s.log(0.25, 1.7));
             (shapes::superquadric(Vec3::ONE, e1, e2, s.count(18, 28), m[0]), 40.0)
         }
         38..52 => {
@@ -283,6 +295,23 @@ pub fn deform(s: &mut Style, part: &mut Part) {
         _ => {
             let (amplitude, scale, seed) = (s.range(0.03, 0.25), s.log(0.8, 5.0), s.rng.random());
             part.map(|p| p + amplitude / scale.max(1.0).sqrt() * noise::vector(p * scale, seed, 2));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn primitives_are_closed() {
+        let config = GeneratorConfig::default();
+        for seed in 0..400 {
+            let mut style = Style::new(ChaCha8Rng::seed_from_u64(seed), &config);
+            let (mut part, _) = primitive(&mut style, [0, 1]);
+            assert_eq!(part.open_edges(), 0, "seed {seed}, {} triangles", part.triangles.len());
+            deform(&mut style, &mut part);
+            assert_eq!(part.open_edges(), 0, "seed {seed}, deformed");
         }
     }
 }

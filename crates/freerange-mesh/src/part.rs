@@ -26,7 +26,7 @@ impl Part {
     /// Adds a triangle unless it is degenerate (poles of grids make such).
     pub fn triangle(&mut self, corners: [u32; 3], material: u16) {
         let [a, b, c] = corners.map(|i| self.positions[i as usize]);
-        if (b - a).cross(c - a).length_squared() > 1e-16 {
+        if (b - a).cross(c - a).length_squared() > 1e-20 {
             self.triangles.push(corners);
             self.materials.push(material);
         }
@@ -137,7 +137,7 @@ impl Assembly {
 
     /// Joins the parts into a normalised mesh, turned by `rotation`.
     pub fn finish(self, rotation: Quat) -> Mesh {
-        let mut mesh = Mesh { materials: self.materials, ..Mesh::default() };
+        let mut mesh = Mesh { materials: self.materials, solid: true, ..Mesh::default() };
         for (part, crease) in &self.parts {
             append_with_normals(&mut mesh, part, crease.to_radians().cos());
         }
@@ -207,5 +207,21 @@ fn append_with_normals(mesh: &mut Mesh, part: &Part, min_cos: f32) {
         });
         mesh.triangles.push(corner_ids);
         mesh.triangle_materials.push(part.materials[face]);
+    }
+}
+
+#[cfg(test)]
+impl Part {
+    /// Edges that are not passed as often in one direction as in the other; vertices are told apart by position.
+    pub fn open_edges(&self) -> usize {
+        let id = |v: u32| (self.positions[v as usize] + Vec3::ZERO).to_array().map(f32::to_bits);
+        let mut edges: HashMap<_, i32> = HashMap::new();
+        for t in &self.triangles {
+            for k in 0..3 {
+                let (a, b) = (id(t[k]), id(t[(k + 1) % 3]));
+                *edges.entry((a.min(b), a.max(b))).or_default() += if a < b { 1 } else { -1 };
+            }
+        }
+        edges.values().filter(|&&n| n != 0).count()
     }
 }

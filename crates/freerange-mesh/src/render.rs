@@ -1,5 +1,7 @@
+use std::sync::LazyLock;
+
 use freerange_camera::Camera;
-use glam::{DMat3, DVec3, Vec3};
+use glam::{DMat3, DVec3, Vec3, Vec4};
 use image::{Rgba, RgbaImage};
 
 use crate::scene::Scene;
@@ -8,15 +10,36 @@ use crate::texture::linear_to_srgb;
 /// Points closer to the camera plane than this are not projected.
 const NEAR: f64 = 1e-3;
 
+/// How far, in weights of the corners, a sample may lie beyond an edge.
+const SLACK: f64 = 1e-9;
+
 /// No triangle at a sample.
 const NOTHING: u32 = u32::MAX;
 
 /// Renders a view with `samples_per_axis` squared samples per pixel (at least one): straight alpha, sRGB-encoded,
 /// transparent black where nothing is hit. Runs on the calling thread.
 pub fn render(scene: &Scene, camera: &Camera, samples_per_axis: u32) -> RgbaImage {
+    render_in_steps(scene, camera, samples_per_axis, false, |_| {})
+}
+
+/// [`render`], by rays only if `by_rays`; calls `done` after each of "visibility", "shading" and "encoding". For benches.
+#[doc(hidden)]
+pub fn render_in_steps(
+    scene: &Scene,
+    camera: &Camera,
+    samples_per_axis: u32,
+    by_rays: bool,
+    mut done: impl FnMut(&'static str),
+) -> RgbaImage {
     let grid = Grid::new(scene, camera, samples_per_axis.max(1));
-    let visible = grid.rasterize(scene).unwrap_or_else(|| grid.trace(scene));
-    grid.shade(scene, &visible)
+    let projected = if by_rays { None } else { grid.rasterize(scene) };
+    let visible = projected.unwrap_or_else(|| grid.trace(scene));
+    done("visibility");
+    let shaded = grid.shade(scene, &visible);
+    done("shading");
+    let image = grid.encode(&shaded);
+    done("encoding");
+    image
 }
 
 /// The samples of the pixels that the object can cover, row by row.
@@ -96,19 +119,36 @@ impl<'a> Grid<'a> {
             let (x0, x1) =
                 (lo.x.ceil().max(0.0) as usize, (hi.x + 1.0).floor().clamp(0.0, self.columns as f64) as usize);
             let (y0, y1) = (lo.y.ceil().max(0.0) as usize, (hi.y + 1.0).floor().clamp(0.0, self.rows as f64) as usize);
-            // Weights of b and c as affine functions of the grid coordinates; slack keeps shared edges closed.
+            // Weights of b, c and a as affine functions of the grid coordinates; slack keeps shared edges closed.
             let (ub, vb) = ((c.y - a.y) / area, (a.x - c.x) / area);
             let (uc, vc) = ((a.y - b.y) / area, (b.x - a.x) / area);
+            let (ua, va) = (-ub - uc, -vb - vc);
+            let slopes = [(ub, vb, 0.0), (uc, vc, 0.0), (ua, va, 1.0)];
+            let (db, dc) = (b.z - a.z, c.z - a.z);
             for y in y0..y1 {
                 let dy = y as f64 - a.y;
-                for x in x0..x1 {
-                    let dx = x as f64 - a.x;
-                    let (wb, wc) = (dx * ub + dy * vb, dx * uc + dy * vc);
-                    if wb < -1e-9 || wc < -1e-9 || wb + wc > 1.0 + 1e-9 {
-                        continue;
+                // The part of the row on the inner side of all three edges.
+                let (mut first, mut last) = (x0 as f64, x1 as f64 - 1.0);
+                for (u, v, w) in slopes {
+                    let at_a = w + dy * v + SLACK;
+                    if u > 0.0 {
+                        first = first.max(a.x - at_a / u);
+                    } else if u < 0.0 {
+                        last = last.min(a.x - at_a / u);
+                    } else if at_a < 0.0 {
+                        last = f64::MIN;
                     }
-                    let w = (a.z + wb * (b.z - a.z) + wc * (c.z - a.z)) as f32;
-                    let i = y * self.columns + x;
+                }
+                if last < first {
+                    continue;
+                }
+                let (first, last) = (first.ceil() as usize, last.floor() as usize);
+                let dx = first as f64 - a.x;
+                let start = a.z + (dx * ub + dy * vb) * db + (dx * uc + dy * vc) * dc;
+                let step = ub * db + uc * dc;
+                let row = y * self.columns;
+                for x in first..=last {
+                    let (w, i) = ((start + (x - first) as f64 * step) as f32, row + x);
                     if w > nearest[i] {
                         nearest[i] = w;
                         visible[i] = id as u32;
@@ -119,35 +159,67 @@ impl<'a> Grid<'a> {
         Some(visible)
     }
 
-    /// Shades every covered sample and averages them per pixel.
-    fn shade(&self, scene: &Scene, visible: &[u32]) -> RgbaImage {
-        let mut image = RgbaImage::new(self.camera.width, self.camera.height);
+    /// The samples of each pixel, shaded: mean linear colour times opacity, and mean opacity. `[rows, columns]`
+    /// of pixels
+    fn shade(&self, scene: &Scene, visible: &[u32]) -> Vec<Vec4> {
         let n = self.per_axis as usize;
-        for (py, y) in (0..self.rows).step_by(n).zip(self.y0..) {
-            for (px, x) in (0..self.columns).step_by(n).zip(self.x0..) {
-                let (mut sum, mut hits) = (Vec3::ZERO, 0);
-                for row in py..py + n {
-                    for column in px..px + n {
+        let cone = 1.0 / (self.camera.fx as f32 * self.per_axis as f32);
+        let share = 1.0 / (n * n) as f32;
+        let mut pixels = Vec::with_capacity(visible.len() / (n * n));
+        for y in (0..self.rows).step_by(n) {
+            for x in (0..self.columns).step_by(n) {
+                let mut sum = Vec4::ZERO;
+                for row in y..y + n {
+                    for column in x..x + n {
                         let id = visible[row * self.columns + column];
                         if id != NOTHING {
-                            let direction = self.direction(column, row);
-                            let surface = scene.surface_along(id as usize, self.origin, direction);
-                            // Clamped per sample: a highlight must not bleed over the silhouette.
-                            sum += scene.radiance(&surface, -direction).clamp(Vec3::ZERO, Vec3::ONE);
-                            hits += 1;
+                            sum += scene.along(id as usize, self.origin, self.direction(column, row), cone);
                         }
                     }
                 }
-                if hits > 0 {
-                    let c = sum / hits as f32;
-                    let code = |v: f32| (255.0 * linear_to_srgb(v) + 0.5) as u8;
-                    let alpha = (255.0 * hits as f32 / (n * n) as f32 + 0.5) as u8;
-                    image.put_pixel(x, y, Rgba([code(c.x), code(c.y), code(c.z), alpha]));
-                }
+                pixels.push(sum * share);
             }
+        }
+        pixels
+    }
+
+    /// Straight alpha and sRGB.
+    fn encode(&self, pixels: &[Vec4]) -> RgbaImage {
+        let mut image = RgbaImage::new(self.camera.width, self.camera.height);
+        let columns = self.columns / self.per_axis as usize;
+        for (i, pixel) in pixels.iter().enumerate().filter(|(_, p)| p.w > 0.0) {
+            let [r, g, b] = (pixel.truncate() / pixel.w).to_array().map(srgb_code);
+            let (x, y) = (self.x0 + (i % columns) as u32, self.y0 + (i / columns) as u32);
+            image.put_pixel(x, y, Rgba([r, g, b, (255.0 * pixel.w + 0.5) as u8]));
         }
         image
     }
+}
+
+/// `(255 * linear_to_srgb(v) + 0.5) as u8`, by a table.
+fn srgb_code(v: f32) -> u8 {
+    /// The least value of each code, and a first guess for each part of [0, 1].
+    static TABLE: LazyLock<([f32; 256], [u8; CELLS + 1])> = LazyLock::new(|| {
+        let code = |v: f32| (255.0 * linear_to_srgb(v) + 0.5) as u8;
+        let least = std::array::from_fn(|i| {
+            // The smallest number with this code, by bisection over the bits of positive numbers.
+            let (mut low, mut high) = (0u32, 1f32.to_bits());
+            while low < high {
+                let middle = (low + high) / 2;
+                if usize::from(code(f32::from_bits(middle))) >= i { high = middle } else { low = middle + 1 }
+            }
+            f32::from_bits(low)
+        });
+        (least, std::array::from_fn(|i| code(i as f32 / CELLS as f32)))
+    });
+    const CELLS: usize = 4096;
+    let (least, guess) = &*TABLE;
+    let v = v.clamp(0.0, 1.0);
+    let mut code = guess[(v * CELLS as f32) as usize];
+    while code < 255 && v >= least[usize::from(code) + 1] {
+        code += 1;
+    }
+    code
 }
 
 /// Pixel rectangle [x0, y0, x1, y1) that holds the object's projection.
@@ -180,6 +252,14 @@ fn window(scene: &Scene, camera: &Camera) -> [u32; 4] {
 mod tests {
     use super::*;
     use crate::{GeneratorConfig, Lighting, generate};
+
+    #[test]
+    fn the_table_of_codes_is_exact() {
+        for i in 0..1_000_000u32 {
+            let v = i as f32 / 900_000.0 - 0.02;
+            assert_eq!(srgb_code(v), (255.0 * linear_to_srgb(v) + 0.5) as u8, "{v}");
+        }
+    }
 
     #[test]
     fn projected_triangles_and_rays_see_the_same() {

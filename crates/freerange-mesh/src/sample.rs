@@ -33,6 +33,7 @@ pub fn sample_surface(scene: &Scene, count: usize, rng: &mut impl Rng) -> Vec<Su
     if total <= 0.0 {
         return Vec::new();
     }
+    let footprint = (total / count.max(1) as f64).sqrt() as f32;
     // The two-dimensional golden-ratio sequence, started at a random point.
     let (mut a, mut b): (f32, f32) = (rng.random(), rng.random());
     let mut triangle = 0;
@@ -45,7 +46,9 @@ pub fn sample_surface(scene: &Scene, count: usize, rng: &mut impl Rng) -> Vec<Su
             a = (a + 0.754_877_7).fract();
             b = (b + 0.569_840_3).fract();
             let root = a.sqrt();
-            let surface = scene.surface(triangle, Vec2::new(root * (1.0 - b), root * b));
+            // Pictures are averaged over the area that the point stands for.
+            let bary = Vec2::new(root * (1.0 - b), root * b);
+            let surface = scene.surface(triangle, bary, scene.shows_back(triangle), footprint);
             let c = scene.diffuse_radiance(&surface);
             SurfacePoint {
                 position: surface.position.to_array(),

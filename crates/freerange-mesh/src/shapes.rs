@@ -47,9 +47,21 @@ pub fn lobed(lobes: usize, depth: f32) -> impl Fn(f32) -> Vec2 {
 /// Revolves a profile about z. The profile starts and ends on the axis, or closes on itself.
 /// Segments longer than `max_step` are subdivided.
 pub fn lathe(spans: &[Span], segments: usize, section: Section, max_step: f32) -> Part {
+    lathe_with(spans, segments, section, max_step, &|_, _, _| 0.0)
+}
+
+/// As [`lathe`], with relief: `relief(span, turn, point)` is added to the radius, `turn` in [0, 1).
+/// It must be the same where two spans meet.
+pub fn lathe_with(
+    spans: &[Span],
+    segments: usize,
+    section: Section,
+    max_step: f32,
+    relief: &dyn Fn(usize, f32, Vec2) -> f32,
+) -> Part {
     let mut part = Part::default();
     let ring: Vec<Vec2> = (0..segments).map(|i| section(TAU * i as f32 / segments as f32)).collect();
-    for span in spans {
+    for (s, span) in spans.iter().enumerate() {
         let points = subdivide(&span.points, max_step);
         let mut lengths = vec![0.0];
         for pair in points.windows(2) {
@@ -59,7 +71,8 @@ pub fn lathe(spans: &[Span], segments: usize, section: Section, max_step: f32) -
         let base = part.positions.len() as u32;
         for (p, length) in points.iter().zip(&lengths) {
             for i in 0..=segments {
-                let c = ring[i % segments] * p.x;
+                let turn = (i % segments) as f32 / segments as f32;
+                let c = ring[i % segments] * (p.x + relief(s, turn, *p));
                 part.vertex(c.extend(p.y), Vec2::new(i as f32 / segments as f32, length / total));
             }
         }
@@ -90,7 +103,7 @@ pub fn smooth(points: &[Vec2], steps: usize) -> Vec<Vec2> {
     let mut out = vec![points[0]];
     for i in 0..points.len() as isize - 1 {
         let (p0, p1, p2, p3) = (at(i - 1), at(i), at(i + 1), at(i + 2));
-        for k in 1..=steps {
+        for k in 1..steps {
             let t = k as f32 / steps as f32;
             let (t2, t3) = (t * t, t * t * t);
             out.push(
@@ -100,6 +113,8 @@ pub fn smooth(points: &[Vec2], steps: usize) -> Vec<Vec2> {
                     + (3.0 * p1 - p0 - 3.0 * p2 + p3) * t3),
             );
         }
+        // To the bit: neighbouring spans meet here.
+        out.push(p2);
     }
     out
 }
@@ -173,7 +188,7 @@ pub fn rounded_box(half: Vec3, radius: f32, materials: [u16; 6]) -> Part {
     let stations = |h: f32, inner: f32| -> Vec<f32> {
         let cells = ((2.0 * inner / 0.16) as usize).clamp(3, 9);
         // Exactly symmetric, so that mirrored faces meet in the same points.
-        let mid = (0..=cells).map(|i| inner * ((2 * i) as f32 - cells as f32) / cells as f32);
+        let mid = (0..=cells).map(|i| inner * (((2 * i) as f32 - cells as f32) / cells as f32));
         if r < 1e-4 {
             return mid.collect();
         }

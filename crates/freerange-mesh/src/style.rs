@@ -7,7 +7,8 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::config::GeneratorConfig;
-use crate::label::{self, Face, Scheme};
+use crate::decor;
+use crate::label::{Face, Product, Scheme};
 use crate::palette::{self, Tone};
 use crate::texture::{Material, Texture};
 
@@ -65,19 +66,6 @@ impl<'a> Style<'a> {
         self.finish(Texture::Flat(color))
     }
 
-    /// Brushed or polished metal.
-    pub fn metal(&mut self) -> Material {
-        let tint = if self.chance(0.15) {
-            palette::hsv(self.range(0.05, 0.13), self.range(0.3, 0.6), self.range(0.6, 0.9))
-        } else {
-            palette::hsv(0.6, self.range(0.0, 0.06), self.range(0.45, 0.92))
-        };
-        let b = palette::shade(&mut self.rng, tint, 0.25);
-        let scale = Vec3::new(self.range(2.0, 20.0), self.range(2.0, 20.0), self.range(2.0, 20.0));
-        let texture = Texture::Noise { a: tint, b, scale, octaves: 3, contrast: 2.0, seed: self.rng.random() };
-        Material { roughness: self.range(0.2, 0.5), metallic: 1.0, ..Material::matt(texture) }
-    }
-
     /// Dark plastic or rubber, as handles and caps have it.
     pub fn dark_plastic(&mut self) -> Material {
         let color = palette::color(&mut self.rng, Tone::Dark);
@@ -104,12 +92,12 @@ impl<'a> Style<'a> {
             seed: self.rng.random(),
             specular: if glossy || self.chance(0.6) { self.range(0.03, 0.06) } else { 0.0 },
             roughness: if glossy { self.range(0.12, 0.4) } else { self.range(0.45, 1.0) },
-            metallic: 0.0,
+            ..Material::default()
         }
     }
 
     /// A colour to go with `a`: a shade of it, a contrast, or anything.
-    fn partner(&mut self, a: Vec3) -> Vec3 {
+    pub fn partner(&mut self, a: Vec3) -> Vec3 {
         match self.count(0, 10) {
             0..4 => palette::shade(&mut self.rng, a, 0.8),
             4..8 => palette::contrast(&mut self.rng, a),
@@ -131,7 +119,8 @@ impl<'a> Style<'a> {
     pub fn pattern(&mut self, a: Vec3) -> Texture {
         let b = self.partner(a);
         let seed = self.rng.random();
-        match self.count(0, 100) {
+        match self.count(0, 112) {
+            100.. => self.cloth(a),
             0..6 => {
                 let direction = self.axis();
                 let (lo, hi) = (self.range(-0.4, 0.0), self.range(0.05, 0.4));
@@ -205,9 +194,14 @@ impl<'a> Style<'a> {
             84..91 => self.speckle(a),
             _ => {
                 let scheme = Scheme { ground: a, ..self.scheme() };
+                let (w, h) = (self.count(128, 320), self.count(128, 256));
+                if self.chance(0.5) {
+                    let colors = [scheme.ink, scheme.accent];
+                    return Texture::Print(Arc::new(decor::decor(&mut self.rng, a, colors, w, h)));
+                }
                 let face = if self.chance(0.7) { Face::Front } else { Face::Side };
-                let (w, h) = (self.count(96, 192), self.count(96, 160));
-                Texture::Print(Arc::new(label::draw(&mut self.rng, &scheme, face, w, h)))
+                let product = Product::random(&mut self.rng, &scheme);
+                Texture::Print(Arc::new(product.draw(&mut self.rng, face, w, h)))
             }
         }
     }
@@ -235,15 +229,25 @@ impl<'a> Style<'a> {
         }
     }
 
-    /// Printed card or foil.
-    pub fn print(&mut self, scheme: &Scheme, face: Face, aspect: f32) -> Material {
-        // About 128 x 128 pixels, whatever the aspect.
-        let w = (128.0 * aspect.sqrt()).clamp(40.0, 320.0);
-        let h = (128.0 / aspect.sqrt()).clamp(40.0, 320.0);
-        let raster = label::draw(&mut self.rng, scheme, face, w as usize, h as usize);
+    /// Printed card, paper or foil; `size` is the face's width and height in units of which the print has 512 pixels.
+    pub fn print(&mut self, product: &Product, face: Face, size: Vec2) -> Material {
+        let pixels = (512.0 * size).clamp(Vec2::splat(24.0), Vec2::splat(640.0));
+        let raster = product.draw(&mut self.rng, face, pixels.x as usize, pixels.y as usize);
         let mut material = self.finish(Texture::Print(Arc::new(raster)));
         material.variation = material.variation.min(0.06);
         material
+    }
+
+    pub fn product(&mut self, scheme: &Scheme) -> Product {
+        Product::random(&mut self.rng, scheme)
+    }
+
+    /// Painted decoration on a ground colour, for a surface of that size (as in [`Style::print`]).
+    pub fn decor(&mut self, ground: Vec3, size: Vec2) -> Material {
+        let colors = [palette::contrast(&mut self.rng, ground), self.partner(ground)];
+        let pixels = (512.0 * size).clamp(Vec2::splat(24.0), Vec2::splat(640.0));
+        let raster = decor::decor(&mut self.rng, ground, colors, pixels.x as usize, pixels.y as usize);
+        self.finish(Texture::Print(Arc::new(raster)))
     }
 
     pub fn scheme(&mut self) -> Scheme {

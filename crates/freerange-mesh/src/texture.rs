@@ -2,9 +2,11 @@
 
 use std::sync::{Arc, LazyLock};
 
-use glam::{Vec2, Vec3};
+use glam::{Vec2, Vec3, Vec4};
 
 use crate::noise;
+use crate::pattern::{Pattern, Wear};
+use crate::picture::Map;
 
 /// Encodes one linear value as sRGB; clamps to [0, 1].
 pub fn linear_to_srgb(x: f32) -> f32 {
@@ -32,6 +34,12 @@ impl Raster {
     pub fn new(width: usize, height: usize, fill: Vec3) -> Self {
         let (width, height) = (width.max(1), height.max(1));
         Self { width, height, pixels: vec![encode(fill); width * height] }
+    }
+
+    /// A picture of sRGB-encoded pixels, row 0 at the top. Both sides are at least 1.
+    pub(crate) fn from_encoded(width: usize, height: usize, pixels: Vec<[u8; 4]>) -> Self {
+        debug_assert_eq!(pixels.len(), width * height);
+        Self { width, height, pixels }
     }
 
     /// Width in pixels.
@@ -208,6 +216,12 @@ pub enum Texture {
     },
     /// A picture over (u, v).
     Print(Arc<Raster>),
+    /// A picture from a file; its alpha is the surface's alpha.
+    Image(Map),
+    /// Woven, knitted, brushed, glazed and other made surfaces.
+    Pattern(Box<Pattern>),
+    /// Dirt and scratches over another texture.
+    Worn(Box<Wear>),
     /// `over` where a thresholded noise is high, else `base`: stains, glaze, crust.
     Patches {
         /// Below the threshold.
@@ -231,6 +245,15 @@ fn smoothstep(lo: f32, hi: f32, x: f32) -> f32 {
 }
 
 impl Texture {
+    /// Linear colour and alpha at rest position `p` and surface coordinates `uv`. Pictures from files are averaged over
+    /// about the length `footprint` in (u, v).
+    pub fn rgba(&self, p: Vec3, uv: Vec2, footprint: f32) -> Vec4 {
+        match self {
+            Self::Image(map) => map.sample(uv, footprint),
+            other => other.color(p, uv).extend(1.0),
+        }
+    }
+
     /// Linear colour at rest position `p` and surface coordinates `uv`.
     pub fn color(&self, p: Vec3, uv: Vec2) -> Vec3 {
         match self {
@@ -284,6 +307,9 @@ impl Texture {
                 colors.get(i).or(colors.last()).copied().unwrap_or(Vec3::splat(0.5))
             }
             Self::Print(raster) => raster.sample(uv),
+            Self::Image(map) => map.sample(uv, 0.0).truncate(),
+            Self::Pattern(pattern) => pattern.color(p, uv),
+            Self::Worn(wear) => wear.color(p, uv),
             Self::Patches { base, over, scale, threshold, soft, seed } => {
                 let t = smoothstep(threshold - soft, threshold + soft, noise::fbm(p * *scale, *seed, 3));
                 match t {
@@ -296,11 +322,30 @@ impl Texture {
     }
 }
 
+/// What the alpha of a surface means.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub enum AlphaMode {
+    /// Nothing: the surface is opaque.
+    #[default]
+    Opaque,
+    /// Where it is below the cutoff there is no surface; elsewhere it is opaque.
+    Mask {
+        /// Least alpha of the surface that is there.
+        cutoff: f32,
+    },
+    /// How much of what lies behind the surface hides.
+    Blend,
+}
+
 /// How a surface reflects light: a coloured base under a clear specular layer, or a metal.
 #[derive(Clone, Debug)]
 pub struct Material {
     /// Base colour.
     pub texture: Texture,
+    /// Multiplied onto the base colour and its alpha; linear.
+    pub factor: Vec4,
+    /// What the alpha of the base colour means.
+    pub alpha: AlphaMode,
     /// Amplitude of a slow brightness variation over the surface, 0 for none.
     pub variation: f32,
     /// Seed of that variation.
@@ -311,21 +356,83 @@ pub struct Material {
     pub roughness: f32,
     /// 1 for metals: the base colour tints the reflection and nothing is diffuse.
     pub metallic: f32,
+    /// Linear values multiplied onto roughness (green) and metallic (blue), as in glTF.
+    pub metallic_roughness: Option<Map>,
+    /// Normals in tangent space as in glTF (x along u, y up in the picture, z outwards), with the scale of x and y.
+    pub normal_map: Option<(Map, f32)>,
+    /// Light that the surface gives off; linear radiance.
+    pub emission: Vec3,
+    /// Colours multiplied onto `emission`.
+    pub emission_map: Option<Map>,
+    /// Shows its base colour as it is, whatever the light.
+    pub unlit: bool,
+}
+
+impl Default for Material {
+    /// White and matt.
+    fn default() -> Self {
+        Self {
+            texture: Texture::Flat(Vec3::ONE),
+            factor: Vec4::ONE,
+            alpha: AlphaMode::Opaque,
+            variation: 0.0,
+            seed: 0,
+            specular: 0.0,
+            roughness: 1.0,
+            metallic: 0.0,
+            metallic_roughness: None,
+            normal_map: None,
+            emission: Vec3::ZERO,
+            emission_map: None,
+            unlit: false,
+        }
+    }
 }
 
 impl Material {
     /// A matt material without a specular layer.
     pub fn matt(texture: Texture) -> Self {
-        Self { texture, variation: 0.0, seed: 0, specular: 0.0, roughness: 1.0, metallic: 0.0 }
+        Self { texture, ..Self::default() }
     }
 
     /// Linear base colour at rest position `p` and surface coordinates `uv`, within [0, 1].
     pub fn albedo(&self, p: Vec3, uv: Vec2) -> Vec3 {
-        let color = self.texture.color(p, uv);
-        if self.variation == 0.0 {
-            return color;
+        self.rgba(p, uv, Vec4::ONE, 0.0).truncate()
+    }
+
+    /// Linear base colour and alpha at rest position `p` and surface coordinates `uv`, times `tint`, within [0, 1].
+    /// Pictures are averaged over about the length `footprint` in (u, v).
+    pub fn rgba(&self, p: Vec3, uv: Vec2, tint: Vec4, footprint: f32) -> Vec4 {
+        let mut color = self.texture.rgba(p, uv, footprint) * self.factor * tint;
+        if self.variation != 0.0 {
+            let n = noise::fbm(p * 7.0, self.seed, 2) - 0.5;
+            color = (color.truncate() * (1.0 + 2.0 * self.variation * n)).extend(color.w);
         }
-        let n = noise::fbm(p * 7.0, self.seed, 2) - 0.5;
-        (color * (1.0 + 2.0 * self.variation * n)).clamp(Vec3::ZERO, Vec3::ONE)
+        color.clamp(Vec4::ZERO, Vec4::ONE)
+    }
+
+    /// True if some property comes from a picture of a file.
+    pub(crate) fn has_pictures(&self) -> bool {
+        matches!(self.texture, Texture::Image(_))
+            || self.metallic_roughness.is_some()
+            || self.normal_map.is_some()
+            || self.emission_map.is_some()
+    }
+
+    /// Light given off at surface coordinates `uv`; linear. Pictures are averaged over about the length `footprint`.
+    pub fn emitted(&self, uv: Vec2, footprint: f32) -> Vec3 {
+        match &self.emission_map {
+            Some(map) if self.emission != Vec3::ZERO => self.emission * map.sample(uv, footprint).truncate(),
+            _ => self.emission,
+        }
+    }
+
+    /// How much of what lies behind a surface of that alpha is hidden, within [0, 1].
+    pub fn opacity(&self, alpha: f32) -> f32 {
+        match self.alpha {
+            AlphaMode::Opaque => 1.0,
+            AlphaMode::Mask { cutoff } => f32::from(u8::from(alpha >= cutoff)),
+            AlphaMode::Blend => alpha.clamp(0.0, 1.0),
+        }
     }
 }

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use glam::{Vec2, Vec3, Vec3A};
+use glam::{Vec2, Vec3};
 use obvhs::BvhBuildParams;
 use obvhs::bvh2::Bvh2;
 use obvhs::bvh2::builder::build_bvh2_from_tris;
@@ -10,8 +10,14 @@ use obvhs::ray::{Ray, RayHit};
 use obvhs::rt_triangle::RtTriangle;
 use obvhs::triangle::Triangle;
 
+use crate::mesh::Mesh;
+use crate::texture::AlphaMode;
+
 /// Slack of the inside test in barycentric coordinates: rays through a shared edge must not slip between.
 const EDGE: f32 = -1e-6;
+
+/// Surfaces that a ray looks through at most.
+const MAX_LAYERS: usize = 100;
 
 /// The nearest intersection.
 #[derive(Clone, Copy, Debug)]
@@ -31,6 +37,8 @@ pub struct Tracer {
     bvh: Bvh2,
     /// In the order of the hierarchy's leaves.
     triangles: Vec<RtTriangle>,
+    /// True if some material is not opaque.
+    veiled: bool,
 }
 
 fn intersect(t: &RtTriangle, ray: &Ray) -> f32 {
@@ -49,13 +57,16 @@ fn intersect(t: &RtTriangle, ray: &Ray) -> f32 {
 }
 
 impl Tracer {
-    pub fn new(corners: impl Iterator<Item = [Vec3; 3]>) -> Self {
-        let triangles: Vec<Triangle> =
-            corners.map(|[a, b, c]| Triangle { v0: a.into(), v1: b.into(), v2: c.into() }).collect();
+    pub fn new(mesh: &Mesh) -> Self {
+        let triangles: Vec<Triangle> = (0..mesh.triangles.len())
+            .map(|i| mesh.corners(i))
+            .map(|[a, b, c]| Triangle { v0: a.into(), v1: b.into(), v2: c.into() })
+            .collect();
         let params = BvhBuildParams { pre_split: false, ..BvhBuildParams::fast_build() };
         let bvh = build_bvh2_from_tris(&triangles, params, &mut Duration::default());
         let triangles = bvh.primitive_indices.iter().map(|&i| RtTriangle::from(&triangles[i as usize])).collect();
-        Self { bvh, triangles }
+        let veiled = mesh.materials.iter().any(|m| m.alpha != AlphaMode::Opaque);
+        Self { bvh, triangles, veiled }
     }
 
     /// The nearest intersection beyond `tmin`.
@@ -81,8 +92,43 @@ impl Tracer {
         !self.bvh.ray_traverse_miss(ray, |ray, id| intersect(&self.triangles[id], ray))
     }
 
-    /// Outward unit normal of the plane through three corners.
-    pub fn plane_normal([a, b, c]: [Vec3; 3]) -> Vec3 {
-        Vec3A::from(b - a).cross((c - a).into()).normalize_or_zero().into()
+    /// Where a ray ends that passes through a surface with the probability of its transparency: at the first surface
+    /// behind which less than the share `chance` of the light is left.
+    pub fn closest_by_chance(&self, mesh: &Mesh, origin: Vec3, direction: Vec3, chance: f32) -> Option<RawHit> {
+        let mut left = 1.0;
+        self.through(origin, direction, |hit| {
+            if self.veiled {
+                left *= 1.0 - mesh.opacity(hit.triangle as usize, hit.bary);
+            } else {
+                left = 0.0;
+            }
+            left > chance
+        })
+    }
+
+    /// The share of light that arrives along a ray from infinity.
+    pub fn transmittance(&self, mesh: &Mesh, origin: Vec3, direction: Vec3) -> f32 {
+        if !self.veiled {
+            return f32::from(u8::from(!self.occluded(origin, direction, 0.0)));
+        }
+        let mut left = 1.0;
+        self.through(origin, direction, |hit| {
+            left *= 1.0 - mesh.opacity(hit.triangle as usize, hit.bary);
+            left > 0.0
+        });
+        left
+    }
+
+    /// Visits the surfaces along a ray from the front to the back until `go_on` says no, and returns the last one then.
+    pub fn through(&self, origin: Vec3, direction: Vec3, mut go_on: impl FnMut(&RawHit) -> bool) -> Option<RawHit> {
+        let mut start = 0.0;
+        for _ in 0..MAX_LAYERS {
+            let hit = self.closest(origin, direction, start)?;
+            if !go_on(&hit) {
+                return Some(hit);
+            }
+            start = hit.t * (1.0 + 4.0 * f32::EPSILON) + 1e-6;
+        }
+        None
     }
 }

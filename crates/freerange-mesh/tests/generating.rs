@@ -1,12 +1,12 @@
 //! Properties of generated objects, lightings and cameras.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use freerange_mesh::{
-    CameraConfig, Coverage, GeneratorConfig, Lighting, LightingConfig, Scene, generate, kind_of, orbit_cameras, render,
-    sample_surface,
+    CameraConfig, Coverage, GalleryConfig, GeneratorConfig, Kind, Lighting, LightingConfig, Scene, Texture, gallery,
+    generate, kind_of, orbit_cameras, render, sample_surface,
 };
-use glam::Vec3;
+use glam::{Vec2, Vec3};
 use proptest::prelude::*;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -62,9 +62,37 @@ fn every_family_appears_and_shows_only_its_outside() {
 }
 
 #[test]
+fn surfaces_of_every_family_are_closed_and_have_no_degenerate_triangles() {
+    for (kind, _) in GeneratorConfig::default().weights() {
+        let config = GeneratorConfig::only(kind);
+        for seed in 0..25 {
+            let mesh = generate(seed, &config).unwrap();
+            // Every edge is passed as often in one direction as in the other. Vertices are told apart by position: the
+            // same point before normalisation is the same to the bit after it.
+            let id = |v: u32| (mesh.positions[v as usize] + Vec3::ZERO).to_array().map(f32::to_bits);
+            let mut edges: BTreeMap<_, i32> = BTreeMap::new();
+            for (i, t) in mesh.triangles.iter().enumerate() {
+                let longest = (0..3)
+                    .map(|k| mesh.positions[t[k] as usize].distance(mesh.positions[t[(k + 1) % 3] as usize]))
+                    .fold(0.0, f32::max);
+                assert!(mesh.area(i) > 1e-7 * longest, "{kind:?} {seed}: triangle {i} of area {}", mesh.area(i));
+                for k in 0..3 {
+                    let (a, b) = (id(t[k]), id(t[(k + 1) % 3]));
+                    *edges.entry((a.min(b), a.max(b))).or_default() += if a < b { 1 } else { -1 };
+                }
+            }
+            let open = edges.values().filter(|&&n| n != 0).count();
+            assert!(open == 0, "{kind:?} {seed}: {open} of {} edges are open", edges.len());
+        }
+    }
+}
+
+#[test]
 fn families_follow_their_weights() {
     let config = GeneratorConfig::default();
     let total: f32 = config.weights().iter().map(|w| w.1).sum();
+    // Unrelated primitives are a minority.
+    assert!((config.composition + config.stack) / total <= 0.2);
     let n = 4000u16;
     let kinds: Vec<_> = (0..u64::from(n)).map(|seed| kind_of(seed, &config).unwrap()).collect();
     assert_eq!(kinds.iter().collect::<BTreeSet<_>>().len(), config.weights().len());
@@ -81,7 +109,7 @@ proptest! {
     fn objects_are_sound(seed: u64) {
         let mesh = generate(seed, &GeneratorConfig::default()).unwrap();
         prop_assert!(mesh.validate().is_ok());
-        prop_assert!((100..=16_000).contains(&mesh.triangles.len()), "{} triangles", mesh.triangles.len());
+        prop_assert!((100..60_000).contains(&mesh.triangles.len()), "{} triangles", mesh.triangles.len());
         let reach = mesh.positions.iter().map(|p| p.length()).fold(0.0, f32::max);
         prop_assert!((0.4999..=0.5).contains(&reach), "reach {reach}");
         let lo = mesh.positions.iter().copied().fold(Vec3::MAX, Vec3::min);
@@ -118,6 +146,8 @@ fn defaults_are_valid_and_unknown_fields_are_refused() {
     assert!(GeneratorConfig::default().validate().is_ok());
     assert!(LightingConfig::default().validate().is_ok());
     assert!(CameraConfig::default().validate().is_ok());
+    assert!(GalleryConfig::default().validate().is_ok());
+    assert!(serde_json::from_str::<GalleryConfig>(r#"{"rows": 1}"#).is_err());
     assert_eq!(serde_json::from_str::<GeneratorConfig>("{}").unwrap(), GeneratorConfig::default());
     assert!(serde_json::from_str::<GeneratorConfig>(r#"{"mugs": 1}"#).is_err());
     assert!(serde_json::from_str::<LightingConfig>(r#"{"moon": 1}"#).is_err());
@@ -148,5 +178,53 @@ fn cameras_frame_the_object_and_cover_what_they_should() {
         for (a, b) in side.iter().flat_map(|a| side.iter().map(move |b| (a, b))) {
             assert!(a.center().angle_between(b.center()) < 70.1f64.to_radians());
         }
+    }
+}
+
+#[test]
+fn a_gallery_has_one_object_per_tile() {
+    let config = GalleryConfig { objects: 7, columns: 3, tile: 40, samples: 2, ..GalleryConfig::default() };
+    let sheet = gallery(&config).unwrap();
+    assert_eq!(sheet.dimensions(), (120, 120));
+    let inked = |column: u32, row: u32| {
+        let pixels = (0..1600).map(|i| sheet.get_pixel(40 * column + i % 40, 40 * row + i / 40).0);
+        pixels.filter(|p| *p != [255; 3]).count()
+    };
+    for i in 0..9 {
+        let n = inked(i % 3, i / 3);
+        assert!(if i < 7 { n > 20 } else { n == 0 }, "tile {i}: {n} pixels");
+    }
+    // A later start shows the same objects further to the left.
+    let later = gallery(&GalleryConfig { objects: 1, columns: 1, first_seed: 4, ..config.clone() }).unwrap();
+    let tile = image::imageops::crop_imm(&sheet, 40, 40, 40, 40).to_image();
+    assert_eq!(later, tile);
+    for wrong in [
+        GalleryConfig { objects: 0, ..config.clone() },
+        GalleryConfig { columns: 0, ..config.clone() },
+        GalleryConfig { tile: 5000, ..config.clone() },
+        GalleryConfig { objects: 100_000, tile: 1000, ..config.clone() },
+    ] {
+        assert!(gallery(&wrong).is_err(), "{wrong:?}");
+    }
+}
+
+#[test]
+fn prints_show_marks_of_several_colours() {
+    for kind in [Kind::Carton, Kind::Can, Kind::Pouch, Kind::Book] {
+        let mut printed = 0;
+        for seed in 0..10 {
+            let mesh = generate(seed, &GeneratorConfig::only(kind)).unwrap();
+            let rasters = mesh.materials.iter().filter_map(|m| match &m.texture {
+                Texture::Print(raster) => Some(raster),
+                _ => None,
+            });
+            for raster in rasters {
+                assert!(raster.width() <= 640 && raster.height() <= 640);
+                let samples = (0..4096).map(|i| raster.sample(Vec2::new((i % 64) as f32, (i / 64) as f32) / 64.0));
+                let colors: BTreeSet<_> = samples.map(|c| (8.0 * c).as_ivec3().to_array()).collect();
+                printed += usize::from(colors.len() >= 3);
+            }
+        }
+        assert!(printed >= 10, "{kind:?}: {printed} prints with three colours");
     }
 }

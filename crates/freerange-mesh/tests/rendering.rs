@@ -17,6 +17,7 @@ fn mesh(positions: Vec<Vec3>, normals: Vec<Vec3>, triangles: Vec<[u32; 3]>, albe
         triangle_materials: vec![0; triangles.len()],
         triangles,
         materials: vec![Material::matt(Texture::Flat(Vec3::splat(albedo)))],
+        ..Mesh::default()
     }
 }
 

@@ -9,19 +9,21 @@
 //! (ties in index order); a splat's opacity at a pixel is at most 0.99, and ignored below 1/255; blending stops before the
 //! splat that would take the transmittance to 1e-4 or below.
 //!
-//! * [`rasterize`]: the differentiable operation on tensors, many objects and views in one call.
+//! * `rasterize` (feature `op`): the differentiable operation on tensors, many objects and views in one call.
 //! * [`render`], [`render_backward`]: the same on plain slices, without a tensor library.
 //! * [`mod@reference`]: slow, in f64, for tests.
 
 mod config;
 mod cpu;
 mod error;
+#[cfg(feature = "op")]
 mod op;
 pub mod reference;
 
 pub use config::RasterConfig;
 pub use cpu::{Gradients, RenderOutput, render, render_backward};
 pub use error::RasterError;
+#[cfg(feature = "op")]
 pub use op::rasterize;
 
 /// Channels per Gaussian.

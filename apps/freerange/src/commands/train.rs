@@ -15,7 +15,7 @@ use crate::{
 /// Writes checkpoint.safetensors (averaged weights), log.jsonl (one line per step) and the state to go on from.
 #[derive(clap::Args)]
 pub struct Args {
-    /// Configuration, such as configs/tiny.toml.
+    /// Configuration: a file such as configs/tiny.toml, or tiny, base or paper.
     config: PathBuf,
     /// Folder of the run.
     #[arg(short, long)]

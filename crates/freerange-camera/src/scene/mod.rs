@@ -9,9 +9,11 @@ mod distortion;
 mod files;
 mod json;
 mod pose;
+mod write;
 
 pub use cutout::{BACKGROUND_TOLERANCE, cut_out};
 pub use distortion::Distortion;
+pub use write::transforms_json;
 
 use crate::{Camera, CameraError, View, error::Place};
 use files::Images;

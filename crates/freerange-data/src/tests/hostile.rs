@@ -3,17 +3,15 @@ use std::path::{Path, PathBuf};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::{message, metadata_of, toy, toy_config};
-use crate::generate::generate_with;
+use super::{build_toys, message, metadata_of, open, toy, write_shard};
 use crate::sample::encode;
-use crate::{DataError, Manifest, ShardReader, ShardWriter, Shards, inspect};
+use crate::shard::{END, tar_bytes};
+use crate::{BuildOptions, DataError, ImageFormat, Manifest, ShardReader, Store, inspect};
 
 /// A shard of two toys.
 fn shard(folder: &Path) -> (PathBuf, Vec<u8>) {
     let path = folder.join("a.tar");
-    let mut writer = ShardWriter::create(&path).unwrap();
-    (1..3).map(toy).for_each(|o| writer.add(&o, &metadata_of(&o)).unwrap());
-    writer.finish().unwrap();
+    write_shard(&path, 1..3, ImageFormat::Png);
     let bytes = std::fs::read(&path).unwrap();
     (path, bytes)
 }
@@ -22,9 +20,13 @@ fn shard(folder: &Path) -> (PathBuf, Vec<u8>) {
 fn read_all(path: &Path, bytes: &[u8]) -> Result<usize, DataError> {
     std::fs::write(path, bytes).unwrap();
     let reader = ShardReader::open(path)?;
+    let in_memory = ShardReader::from_bytes(path, bytes.to_vec())?;
+    assert_eq!(in_memory.len(), reader.len());
     for i in 0..reader.len() {
         reader.metadata(i)?;
+        reader.leaves(i)?;
         reader.read(i, &[2, 3])?;
+        in_memory.read(i, &[2, 3])?;
     }
     Ok(reader.len())
 }
@@ -65,12 +67,11 @@ type Entries = Vec<(String, Vec<u8>)>;
 /// A shard of one toy whose entries `change` has changed.
 fn with_entries(path: &Path, change: impl FnOnce(&mut Entries)) -> Result<usize, DataError> {
     let object = toy(1);
-    let mut entries = encode(&object, &metadata_of(&object), path).unwrap();
+    let mut entries = encode(&object, None, &metadata_of(&object), ImageFormat::Png, path).unwrap();
     change(&mut entries);
-    let mut writer = ShardWriter::create(path).unwrap();
-    writer.add_encoded("toy-001", &entries).unwrap();
-    writer.finish().unwrap();
-    read_all(path, &std::fs::read(path).unwrap())
+    let mut bytes = tar_bytes(&object.id, &entries, path).unwrap();
+    bytes.extend(END);
+    read_all(path, &bytes)
 }
 
 #[test]
@@ -79,15 +80,16 @@ fn messages_name_shard_object_and_entry() {
     let path = folder.path().join("b.tar");
     let refused = |change: &dyn Fn(&mut Entries), entry: &str, text: &str| {
         let found = message(with_entries(&path, |e| change(e)));
-        let place = format!("b.tar: object toy-001, entry {entry}: expected ");
+        let place = format!("b.tar: object generated-00000001, entry {entry}: expected ");
         assert!(found.contains(&place) && found.contains(text), "{found}");
     };
     assert_eq!(with_entries(&path, |_| ()).unwrap(), 1);
     refused(&|e| drop(e.remove(0)), "json", "none");
     refused(&|e| drop(e.remove(1)), "cameras.json", "none");
     refused(&|e| drop(e.remove(2)), "gaussians.safetensors", "none");
-    refused(&|e| e.truncate(3), "000.png", "none");
-    refused(&|e| drop(e.remove(3)), "001.png", "000.png");
+    refused(&|e| e.truncate(3), "000.webp", "none");
+    refused(&|e| drop(e.remove(3)), "001.png", "000.webp");
+    refused(&|e| e[4].0 = "001.webp".into(), "001.webp", "001.png");
     refused(&|e| drop(e.pop()), "cameras.json", "1 cameras");
     refused(&|e| e.push(e[0].clone()), "json", "second");
     refused(&|e| e.push(("exe".into(), vec![])), "exe", "002.png");
@@ -98,7 +100,7 @@ fn messages_name_shard_object_and_entry() {
             e[k].1 = text.replacen(from, to, 1).into();
         }
     };
-    refused(&edit(0, "toy-001", "toy-002"), "json", "toy-002");
+    refused(&edit(0, "generated-00000001", "generated-00000002"), "json", "generated-00000002");
     refused(&edit(0, "\"seed\"", "\"sead\""), "json", "sead");
     refused(&edit(1, "opencv", "opengl"), "cameras.json", "opengl");
     refused(&edit(1, "\"width\":6", "\"width\":0"), "cameras.json", "0 x 4");
@@ -118,7 +120,7 @@ fn messages_name_shard_object_and_entry() {
         o[4].1 = png.into_inner();
     };
     refused(&|e| e[4].1.truncate(40), "001.png", "PNG");
-    refused(&|e| other(e, image::DynamicImage::new_rgb8(6, 4)), "001.png", "Rgb8");
+    refused(&|e| other(e, image::DynamicImage::new_rgba16(6, 4)), "001.png", "Rgba16");
     refused(&|e| other(e, image::DynamicImage::new_rgba8(3000, 3000)), "001.png", "3000 x 3000");
 }
 
@@ -158,57 +160,55 @@ fn headers_that_lie_cost_no_memory() {
 fn manifests_that_do_not_fit_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
-    assert!(matches!(Shards::open(root, &[2]), Err(DataError::Io { .. })));
-    generate_with(&toy_config(), root, |_, _| (), |seed| Ok(toy(seed))).unwrap();
-    Shards::open(root, &[2, 3]).unwrap();
-    assert!(message(Shards::open(root, &[2, 9])).contains("expected Gaussians at depth 9, found depths [2, 3]"));
+    assert!(message(open(root, &[2])).contains("expected a folder of shards, found none"));
+    build_toys(root, &BuildOptions::default(), |_| Ok(30.0)).unwrap();
+    open(root, &[2, 3]).unwrap();
+    assert!(message(open(root, &[2, 9])).contains("expected Gaussians at depth 9, found depths [2, 3]"));
 
-    let path = Manifest::path(root);
+    let path = root.join("manifest.json");
     let good = std::fs::read_to_string(&path).unwrap();
     let refused = |from: &str, to: &str, text: &str| {
-        assert!(good.contains(from), "{good}");
+        assert!(good.contains(from), "{from} in {good}");
         std::fs::write(&path, good.replacen(from, to, 1)).unwrap();
-        let found = message(Shards::open(root, &[2]));
+        let found = message(open(root, &[2]));
         assert!(found.contains(text), "{found}");
     };
-    refused("{", "", "no manifest");
-    refused("\"format\": 1", "\"format\": 2, \"news\": 0", "expected 1, found 2");
-    refused("\"config\": {", "\"config\": { \"news\": 0,", "news");
-    refused("\"objects\": 10", "\"objects\": 0", "config.objects");
-    refused("\"objects\": 10", "\"objects\": 4000000000", "shards[2].samples");
-    refused("shard-00001.tar", "../shard-00001.tar", "shards[1].name");
-    refused("\"index\": 1", "\"index\": 0", "shards[1].index");
-    refused("\"samples\": 4", "\"samples\": 18446744073709551615", "shards[0].samples");
-    refused("\"samples\": 2", "\"samples\": 1", "shards[2].samples");
-    refused("\"count\": 16", "\"count\": 17", "shards[0].statistics");
-    let bytes = format!("\"bytes\": {}", Manifest::load_text(&good).shards[0].bytes);
-    refused(&bytes, "\"bytes\": 1", "expected 1 bytes");
+    refused("{", "", "expected a description");
+    refused("\"format\":2", "\"format\":3,\"news\":0", "expected 2, found 3");
+    refused("\"config\":{", "\"config\":{\"news\":0,", "news");
+    refused("\"objects\":10", "\"objects\":0", "plan.objects");
+    refused("\"objects\":10", "\"objects\":4000000000", "plan_sha256");
+    refused("\"index\":1,\"plan", "\"index\":0,\"plan", "shards.index");
+    refused("\"index\":1,\"id", "\"index\":0,\"id", "objects.index");
+    refused("\"id\":\"generated-00000008\"", "\"id\":\"../x\"", "objects.id");
+    refused("\"offset\":0", "\"offset\":512", "objects.offset");
+    refused("\"count\":16", "\"count\":17", "statistics of shard 0");
+    let record = &serde_json::from_str::<Manifest>(&good).unwrap().shards[0];
+    refused(&format!("\"bytes\":{}", record.bytes), "\"bytes\":1", "objects.offset");
+    let bytes = format!("\"bytes\":{}", record.objects[0].bytes);
+    refused(&bytes, "\"bytes\":18446744073709551615", "objects.offset");
+    refused(&format!("\"bytes\":{}", record.bytes), "\"bytes\":9999999", "expected 9999999 bytes");
 
     std::fs::write(&path, &good).unwrap();
     std::fs::remove_file(root.join("shard-00002.tar")).unwrap();
-    assert!(message(Shards::open(root, &[2])).contains("shard-00002.tar"));
+    assert!(message(open(root, &[2])).contains("shard-00002.tar"));
     std::fs::copy(root.join("shard-00001.tar"), root.join("shard-00002.tar")).unwrap();
-    assert!(message(Shards::open(root, &[2])).contains("shard-00002.tar"));
+    assert!(message(open(root, &[2])).contains("shard-00002.tar"));
 }
 
 #[test]
 fn checksums_find_what_readers_do_not() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
-    generate_with(&toy_config(), root, |_, _| (), |seed| Ok(toy(seed))).unwrap();
-    inspect(root, true).unwrap();
+    build_toys(root, &BuildOptions::default(), |_| Ok(30.0)).unwrap();
+    let store = Store::local(root);
+    inspect(&store, true).unwrap();
     let path = root.join("shard-00001.tar");
     let mut bytes = std::fs::read(&path).unwrap();
     let at = bytes.windows(5).position(|w| w == b"CC0-1").unwrap();
     bytes[at] = b'X';
     std::fs::write(&path, bytes).unwrap();
-    inspect(root, false).unwrap();
-    let found = message(inspect(root, true));
+    inspect(&store, false).unwrap();
+    let found = message(inspect(&store, true));
     assert!(found.contains("shard-00001.tar") && found.contains("SHA-256"), "{found}");
-}
-
-impl Manifest {
-    fn load_text(text: &str) -> Self {
-        serde_json::from_str(text).unwrap()
-    }
 }

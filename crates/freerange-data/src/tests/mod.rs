@@ -14,7 +14,13 @@ use image::RgbaImage;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::{DataError, GenerateConfig, Metadata, Object, ObjectConfig};
+use crate::build::{FileFacts, build_with};
+use crate::object::{Made, generated_id};
+use crate::shard::{END, object_bytes};
+use crate::{
+    BuildConfig, BuildOptions, DataError, HeldOutPsnr, ImageFormat, Item, Items, Metadata, Object, ObjectConfig,
+    Seconds, ShardConfig, Shards, Split, Store, Summary,
+};
 
 /// Generated objects at their smallest.
 pub(crate) fn tiny_config() -> ObjectConfig {
@@ -29,10 +35,14 @@ pub(crate) fn tiny_config() -> ObjectConfig {
     config
 }
 
-/// A folder of objects that [`toy`] makes: 3 shards of 4, 4 and 2.
-fn toy_config() -> GenerateConfig {
-    let object = tiny_config();
-    GenerateConfig { objects: 10, objects_per_shard: 4, seed: 7, depths: vec![2, 3], object, ..Default::default() }
+/// Objects that [`toy`] makes: 3 shards of 4, 4 and 2.
+pub(crate) fn toy_config() -> BuildConfig {
+    let shard = ShardConfig { objects_per_shard: 4, validation: 0.0, test: 0.0, ..ShardConfig::default() };
+    BuildConfig { depths: vec![2, 3], shard, object: tiny_config(), ..BuildConfig::default() }
+}
+
+pub(crate) fn toy_items() -> Items {
+    Items::generated(10, 7)
 }
 
 /// An object of noise: two views of 6 x 4 pixels, slices at depths 2 and 3.
@@ -45,7 +55,32 @@ fn toy(seed: u64) -> Object {
     });
     let views = views.collect();
     let mut cloud = |n: usize| Cloud::from_rows((0..n * channel::COUNT).map(|_| rng.random_range(-1.0..1.0)).collect());
-    Object { id: format!("toy-{seed:03}"), views, slices: BTreeMap::from([(2, cloud(4)), (3, cloud(8))]) }
+    Object { id: generated_id(seed), views, slices: BTreeMap::from([(2, cloud(4)), (3, cloud(8))]) }
+}
+
+/// A toy as a build makes it. Its fit is as bad as `psnr` says.
+pub(crate) fn made(seed: u64, psnr: f64) -> (Made, FileFacts) {
+    let object = toy(seed);
+    let leaves = object.slices[&3].clone();
+    let psnr = Some(HeldOutPsnr { leaves: psnr, slices: BTreeMap::from([(2, 20.25), (3, 0.1 + 0.2)]) });
+    (Made { object, leaves, psnr, seconds: Seconds::default() }, FileFacts::default())
+}
+
+/// Builds toys in `folder` on one worker; `make` may fail.
+fn build_toys(
+    folder: &Path,
+    options: &BuildOptions,
+    make: impl Fn(u64) -> Result<f64, DataError> + Sync,
+) -> Result<Summary, DataError> {
+    let make = |item: &Item| {
+        let seed = item.seed.unwrap();
+        make(seed).map(|psnr| made(seed, psnr))
+    };
+    build_with(&toy_config(), &toy_items(), &Store::local(folder), options, |_| (), make)
+}
+
+fn open(folder: &Path, depths: &[u32]) -> Result<Shards, DataError> {
+    Shards::open(&Store::local(folder), depths, None)
 }
 
 fn metadata_of(object: &Object) -> Metadata {
@@ -53,13 +88,57 @@ fn metadata_of(object: &Object) -> Metadata {
         id: object.id.clone(),
         source: "noise".into(),
         licence: "CC0-1.0".into(),
+        file_sha256: None,
+        notes: vec!["one".into()],
         seed: 3,
-        config_sha256: "none".into(),
-        psnr: BTreeMap::from([(2, 20.25), (3, 0.1 + 0.2)]),
+        plan_sha256: "none".into(),
+        split: Split::Test,
+        gaussians: 8,
+        psnr: made(1, 30.0).0.psnr,
+        flagged: false,
+        evaluation: None,
     }
 }
 
-fn assert_same(a: &Object, b: &Object) {
+/// Writes a ball of 320 triangles with a band of another colour as a PLY mesh.
+pub(crate) fn write_ball(path: &Path) {
+    let (rings, sides) = (9, 20);
+    let mut text = format!(
+        "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n\
+         property uchar red\nproperty uchar green\nproperty uchar blue\nelement face {}\n\
+         property list uchar int vertex_indices\nend_header\n",
+        rings * sides,
+        (rings - 1) * sides
+    );
+    for r in 0..rings {
+        for s in 0..sides {
+            let (t, p) = ((r as f32 + 0.1) / (rings as f32 - 0.8) * 3.14159, s as f32 / sides as f32 * 6.28318);
+            let color = if (3..6).contains(&r) { "200 40 30" } else { "30 90 200" };
+            text += &format!("{} {} {} {color}\n", t.sin() * p.cos(), t.sin() * p.sin(), t.cos());
+        }
+    }
+    for r in 0..rings - 1 {
+        for s in 0..sides {
+            let (a, b) = (r * sides + s, r * sides + (s + 1) % sides);
+            text += &format!("4 {a} {} {} {b}\n", a + sides, b + sides);
+        }
+    }
+    std::fs::write(path, text).unwrap();
+}
+
+/// A shard of toys, as a build writes it.
+fn write_shard(path: &Path, seeds: std::ops::Range<u64>, format: ImageFormat) {
+    let mut bytes = Vec::new();
+    for seed in seeds {
+        let object = toy(seed);
+        let leaves = &object.slices[&3];
+        bytes.extend(object_bytes(&object, Some(leaves), &metadata_of(&object), format, path).unwrap());
+    }
+    bytes.extend(END);
+    std::fs::write(path, bytes).unwrap();
+}
+
+pub(crate) fn assert_same(a: &Object, b: &Object) {
     assert_eq!(a.id, b.id);
     assert_eq!(a.slices, b.slices);
     assert_eq!(a.views.len(), b.views.len());
@@ -68,12 +147,16 @@ fn assert_same(a: &Object, b: &Object) {
     }
 }
 
-/// Name and bytes of every file in `folder`.
+/// Name and bytes of every file in `folder` and below, but for locks.
 fn contents(folder: &Path) -> BTreeMap<String, Vec<u8>> {
-    std::fs::read_dir(folder)
-        .unwrap()
+    walkdir::WalkDir::new(folder)
+        .into_iter()
         .map(|e| e.unwrap())
-        .map(|e| (e.file_name().into_string().unwrap(), std::fs::read(e.path()).unwrap()))
+        .filter(|e| e.file_type().is_file())
+        .map(|e| {
+            (e.path().strip_prefix(folder).unwrap().to_str().unwrap().to_owned(), std::fs::read(e.path()).unwrap())
+        })
+        .filter(|(name, _)| !name.starts_with(".lock"))
         .collect()
 }
 

@@ -1,0 +1,252 @@
+//! `freerange data build` and `freerange data generate`
+
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+
+use freerange_data::{
+    BuildConfig, BuildOptions, GaussianSource, HeldOutPsnr, Items, Seconds, Share, Store, Summary, build,
+};
+use freerange_flow::config::TrainConfig;
+
+use crate::{error::CliError, progress::Progress, runtime::peak_memory};
+
+/// Arguments of `data build`.
+#[derive(clap::Args)]
+pub struct Args {
+    #[command(flatten)]
+    input: InputArgs,
+    #[command(flatten)]
+    settings: Settings,
+    #[command(flatten)]
+    work: Work,
+}
+
+/// Arguments of `data generate`.
+#[derive(clap::Args)]
+pub struct GenerateArgs {
+    /// Objects to make.
+    #[arg(long, default_value_t = 1000)]
+    objects: u64,
+    /// Seed of the first object; object i has this plus i.
+    #[arg(long, default_value_t = 0)]
+    first_seed: u64,
+    #[command(flatten)]
+    settings: Settings,
+    #[command(flatten)]
+    work: Work,
+}
+
+/// Which meshes.
+#[derive(clap::Args)]
+pub struct InputArgs {
+    /// Folder of .glb, .gltf, .obj and .ply files, one such file, or a list: a .jsonl file of lines like
+    /// {"path": "chair.glb", "licence": "CC-BY-4.0", "source": "...", "id": "...", "split": "train"}.
+    input: PathBuf,
+    /// Licence of the meshes (SPDX), where a list does not say it.
+    #[arg(long, default_value = "unknown")]
+    licence: String,
+    /// Put before each file's path to say where it comes from, where a list does not say it.
+    #[arg(long, default_value = "")]
+    source: String,
+}
+
+impl InputArgs {
+    /// What the user gave.
+    pub fn path(&self) -> &Path {
+        &self.input
+    }
+
+    /// The meshes.
+    pub fn items(&self) -> Result<Items, CliError> {
+        let list = self.input.extension().is_some_and(|e| e == "jsonl");
+        Ok(match list {
+            true => Items::list(&self.input, &self.source, &self.licence)?,
+            false => Items::find(&self.input, &self.source, &self.licence)?,
+        })
+    }
+}
+
+/// How objects are made and stored.
+#[derive(clap::Args)]
+pub struct Settings {
+    /// Configuration whose [data] is used: tiny, base, paper, or a file.
+    #[arg(long, default_value = "tiny")]
+    config: PathBuf,
+    /// Seed of what is drawn for the objects: cameras, light, fits, splits.
+    #[arg(long)]
+    seed: Option<u64>,
+    /// Where the Gaussians come from: a 3DGS-MCMC fit of the views, or points on the surface (fast, and less exact).
+    #[arg(long, value_enum)]
+    gaussians: Option<Source>,
+    /// Gaussians before the tree.
+    #[arg(long, value_name = "N")]
+    leaves: Option<usize>,
+    /// Keep the Gaussians before the tree, too.
+    #[arg(long)]
+    keep_leaves: bool,
+    /// Depths of the slices to keep, such as 8,10,12.
+    #[arg(long, value_delimiter = ',')]
+    depths: Option<Vec<u32>>,
+    /// Views per object.
+    #[arg(long)]
+    views: Option<usize>,
+    /// Width and height of the views in pixels.
+    #[arg(long)]
+    resolution: Option<u32>,
+    /// Iterations of the fit.
+    #[arg(long)]
+    iterations: Option<usize>,
+    /// Objects per shard.
+    #[arg(long)]
+    objects_per_shard: Option<u64>,
+    /// Least PSNR, in dB on held-out views, of an object to train on.
+    #[arg(long)]
+    min_psnr: Option<f64>,
+}
+
+/// Ways to make Gaussians.
+#[derive(Clone, Copy, Debug, clap::ValueEnum)]
+enum Source {
+    /// 3DGS-MCMC on the rendered views.
+    Fit,
+    /// Points on the mesh.
+    Surface,
+}
+
+impl Settings {
+    /// The configuration with what the arguments change. `default_source` where neither says where Gaussians come from.
+    pub fn build_config(&self, default_source: Option<GaussianSource>) -> Result<BuildConfig, CliError> {
+        let mut config = TrainConfig::load(&self.config)?.build_config();
+        let given = self.gaussians.map(|s| match s {
+            Source::Fit => GaussianSource::Fit,
+            Source::Surface => GaussianSource::Surface,
+        });
+        let object = &mut config.object;
+        object.gaussians = given.or(default_source).unwrap_or(object.gaussians);
+        if let Some(n) = self.leaves {
+            object.surface.points = n;
+            object.fit.max_gaussians = n;
+            object.fit.initial = object.fit.initial.min(n);
+        }
+        object.views = self.views.unwrap_or(object.views);
+        object.cameras.resolution = self.resolution.unwrap_or(object.cameras.resolution);
+        object.fit.iterations = self.iterations.unwrap_or(object.fit.iterations);
+        config.shard.leaves |= self.keep_leaves;
+        config.shard.objects_per_shard = self.objects_per_shard.unwrap_or(config.shard.objects_per_shard);
+        config.shard.min_psnr = self.min_psnr.unwrap_or(config.shard.min_psnr);
+        config.depths = self.depths.clone().unwrap_or(config.depths);
+        config.seed = self.seed.unwrap_or(config.seed);
+        config.validate()?;
+        Ok(config)
+    }
+}
+
+/// How the work is done. None of it changes what comes out.
+#[derive(clap::Args)]
+struct Work {
+    /// Where the shards go: a folder, or s3://bucket/prefix or gs://bucket/prefix (built with --features cloud).
+    #[arg(short, long)]
+    output: String,
+    /// Make only the i-th of n shares of the shards, i from 0 to n - 1. Any number of machines may work side by side
+    /// on one output.
+    #[arg(long, value_name = "I/N", default_value = "0/1")]
+    shard: Share,
+    /// Objects made at once; as many as there are cores if not given. Memory grows with it.
+    #[arg(long, default_value_t = 0, hide_default_value = true)]
+    workers: usize,
+    /// Try again what could not be made before.
+    #[arg(long)]
+    retry_failed: bool,
+    /// Print a line per object.
+    #[arg(long)]
+    each: bool,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs `data build`.
+pub fn run(args: &Args) -> Result<(), CliError> {
+    // A mesh is there to be fitted: the surface is for making objects faster than training consumes them.
+    make(&args.input.items()?, &args.settings.build_config(Some(GaussianSource::Fit))?, &args.work)
+}
+
+/// Runs `data generate`.
+pub fn run_generate(args: &GenerateArgs) -> Result<(), CliError> {
+    make(&Items::generated(args.objects, args.first_seed), &args.settings.build_config(None)?, &args.work)
+}
+
+fn make(items: &Items, config: &BuildConfig, work: &Work) -> Result<(), CliError> {
+    let store = Store::open(&work.output)?;
+    let options = BuildOptions { share: work.shard, workers: work.workers, retry_failed: work.retry_failed };
+    let bar: Mutex<Option<Progress>> = Mutex::new(None);
+    let summary = build(config, items, &store, &options, |done| {
+        let Ok(mut bar) = bar.lock() else { return };
+        let bar = bar.get_or_insert_with(|| Progress::new("objects", done.count[1]));
+        if work.each
+            && let Some(result) = &done.result
+        {
+            match result {
+                Ok((psnr, seconds)) => eprintln!("{:40} {}; {}", done.id, psnr_line(psnr), seconds_line(seconds)),
+                Err(reason) => eprintln!("{:40} failed: {reason}", done.id),
+            }
+        }
+        bar.at(done.count[0], done.id);
+    })?;
+    if let Some(bar) = bar.into_inner().ok().flatten() {
+        bar.finish();
+    }
+    if work.json {
+        println!("{}", serde_json::to_string_pretty(&summary).map_err(CliError::input)?);
+    } else {
+        print(&summary, &work.output, work.shard);
+    }
+    match summary.made == 0 && summary.skipped == 0 {
+        true => Err(CliError::input("no object could be made")),
+        false => Ok(()),
+    }
+}
+
+/// `leaves 30.1 dB, depth 8: 24.0`
+pub fn psnr_line(psnr: &HeldOutPsnr) -> String {
+    let slices: Vec<String> = psnr.slices.iter().map(|(d, p)| format!("{p:.2} at depth {d}")).collect();
+    format!("{:.2} dB before the tree, {}", psnr.leaves, slices.join(", "))
+}
+
+/// `read 0.1 s, ...`
+pub fn seconds_line(seconds: &Seconds) -> String {
+    let stages: Vec<String> = seconds.stages().iter().map(|(name, s)| format!("{name} {s:.2}")).collect();
+    format!("{:.2} s ({})", seconds.total(), stages.join(", "))
+}
+
+fn print(summary: &Summary, output: &str, share: Share) {
+    println!(
+        "{} objects made, {} there already, {} failed, {} flagged as bad fits; {} shards, {:.1} MB in {}",
+        summary.made,
+        summary.skipped,
+        summary.failures.len(),
+        summary.flagged.len(),
+        summary.shards,
+        summary.bytes as f64 / 1e6,
+        Path::new(output).display()
+    );
+    if summary.made > 0 {
+        println!("per object, on one core: {}", seconds_line(&summary.seconds));
+    }
+    if let Some(psnr) = &summary.psnr {
+        println!("PSNR on held-out views: {}", psnr_line(psnr));
+    }
+    if let Some(bytes) = peak_memory() {
+        println!("peak memory: {:.0} MiB", bytes as f64 / f64::from(1 << 20));
+    }
+    for id in &summary.flagged {
+        println!("  flagged: {id}");
+    }
+    for failure in &summary.failures {
+        println!("  failed: {}: {}", failure.id, failure.reason);
+    }
+    match summary.complete {
+        true => println!("complete: manifest.json is written"),
+        false => println!("share {}/{} is done; others are not", share.index, share.count),
+    }
+}

@@ -1,0 +1,31 @@
+//! `freerange data merge`
+
+use freerange_data::{Store, collect, merge};
+
+use crate::error::CliError;
+
+/// Join what several processes or machines have built: writes the manifest once all shards are there.
+///
+/// Processes that share one output need no merge: whoever finishes last writes the manifest.
+#[derive(clap::Args)]
+pub struct Args {
+    /// Output of `data build` or `data generate`, where the manifest goes.
+    output: String,
+    /// Further outputs, of the same configuration and input, whose shards are copied there first.
+    others: Vec<String>,
+}
+
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), CliError> {
+    let store = Store::open(&args.output)?;
+    for other in &args.others {
+        println!("{} shards copied from {other}", collect(&store, &Store::open(other)?)?);
+    }
+    let manifest = merge(&store)?;
+    let (found, all) = (manifest.shards.len(), manifest.plan.shard_count());
+    if !manifest.is_complete() {
+        return Err(CliError::input(format!("{}: {found} of {all} shards are there: build the others", args.output)));
+    }
+    println!("{} objects in {found} shards: manifest.json is written", manifest.objects().count());
+    Ok(())
+}

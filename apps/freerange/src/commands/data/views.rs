@@ -1,0 +1,60 @@
+//! `freerange data views`
+
+use std::path::PathBuf;
+
+use freerange_camera::{View, transforms_json};
+use freerange_data::render_views;
+
+use super::build::{InputArgs, Settings};
+use crate::{error::CliError, output::OutputFolder, progress::Progress};
+
+/// Render a mesh, or each mesh of a folder: posed RGBA images with a transforms.json, as `reconstruct` takes them.
+///
+/// The mesh is taken to the canonical frame first: +z up, its box centred, within radius 0.5. Where there are enough views
+/// (20 by default), transforms_full.json, transforms_partial.json and transforms_val.json name those that `eval` uses.
+#[derive(clap::Args)]
+pub struct Args {
+    #[command(flatten)]
+    input: InputArgs,
+    #[command(flatten)]
+    settings: Settings,
+    /// Where the images go; for a folder of meshes, a folder each therein.
+    #[arg(short, long)]
+    output: PathBuf,
+}
+
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), CliError> {
+    let items = args.input.items()?;
+    let config = args.settings.build_config(None)?;
+    let single = !args.input.path().is_dir() && items.len() == 1;
+    let mut bar = Progress::new("rendering", items.len());
+    for index in 0..items.len() {
+        let Some(item) = items.get(index) else { break };
+        let (views, sets) = render_views(&item, &config)?;
+        let output = OutputFolder::create(&if single { args.output.clone() } else { args.output.join(&item.id) })?;
+        for view in &views {
+            output.picture(&image_name(view), &view.image)?;
+        }
+        let all: Vec<usize> = (0..views.len()).collect();
+        let mut files = vec![("transforms.json", all)];
+        if let Some(sets) = sets {
+            files.push(("transforms_full.json", sets.full));
+            files.push(("transforms_partial.json", sets.partial));
+            files.push(("transforms_val.json", sets.validation));
+        }
+        for (name, chosen) in files {
+            let frames: Vec<_> = chosen.into_iter().map(|i| (image_name(&views[i]), views[i].camera)).collect();
+            output.write(name, transforms_json(&frames).as_bytes())?;
+        }
+        output.commit()?;
+        bar.at(index + 1, &item.id);
+    }
+    bar.finish();
+    println!("{} objects, {} views each, in {}", items.len(), config.object.views, args.output.display());
+    Ok(())
+}
+
+fn image_name(view: &View) -> String {
+    format!("images/{}.png", view.name)
+}
