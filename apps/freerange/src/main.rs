@@ -44,7 +44,16 @@ enum Command {
     Model(commands::model::Command),
 }
 
+/// Lets `freerange ... | head` end quietly, as other programs do: Rust turns the signal of a closed pipe into a panic.
+#[cfg(unix)]
+fn end_with_a_closed_pipe() {
+    // SAFETY: no other thread is there yet, and the default action runs no code of ours.
+    unsafe { libc::signal(libc::SIGPIPE, libc::SIG_DFL) };
+}
+
 fn main() -> ExitCode {
+    #[cfg(unix)]
+    end_with_a_closed_pipe();
     let cli = Cli::parse();
     let level = if cli.verbose { "debug" } else { "warn" };
     let filter = tracing_subscriber::EnvFilter::try_from_default_env().unwrap_or_else(|_| level.into());

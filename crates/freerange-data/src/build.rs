@@ -57,7 +57,7 @@ impl FromStr for Share {
 }
 
 /// How the work is done; none of it changes the result.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct BuildOptions {
     /// Which shards.
     pub share: Share,
@@ -65,12 +65,6 @@ pub struct BuildOptions {
     pub workers: usize,
     /// Whether objects that could not be made are tried again.
     pub retry_failed: bool,
-}
-
-impl Default for BuildOptions {
-    fn default() -> Self {
-        Self { share: Share::default(), workers: 0, retry_failed: false }
-    }
 }
 
 /// An object that is done.
@@ -378,7 +372,7 @@ where
         let whole = |r: &ShardRecord| Ok::<_, DataError>(self.store.size(&r.name())? == Some(r.bytes));
         if let Some(record) = old
             && whole(&record)?
-            && !(self.retry_failed && !record.failures.is_empty())
+            && (!self.retry_failed || record.failures.is_empty())
         {
             // A process killed between the record and the end leaves parts.
             self.store.remove_folder(&parts(shard))?;

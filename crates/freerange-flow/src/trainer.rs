@@ -142,8 +142,14 @@ impl Trainer {
                     }
                     None => {
                         let count = config.data.statistics_objects as u64;
-                        progress(&format!("measuring the statistics of {count} objects"));
-                        measure(source.as_ref(), count, config.stages.last().map_or(0, |s| s.depth))?
+                        let depth = config.stages.last().map_or(0, |s| s.depth);
+                        match source.statistics(depth) {
+                            Some(known) => known.normalization().map_err(freerange_data::DataError::from)?,
+                            None => {
+                                progress(&format!("measuring the statistics of {count} objects"));
+                                measure(source.as_ref(), count, depth)?
+                            }
+                        }
                     }
                 };
                 let state = Progress { step: 0, seconds: 0.0, gradient_square: square, normalization };
@@ -328,12 +334,9 @@ impl Trainer {
     }
 }
 
-/// Normalisation statistics at `depth`: those that the source knows, or over its first `count` objects.
+/// Normalisation statistics over the first `count` objects at `depth`.
 fn measure(source: &dyn ObjectSource, count: u64, depth: u32) -> Result<Normalization, FlowError> {
     use rayon::prelude::*;
-    if let Some(known) = source.statistics(depth) {
-        return Ok(known.normalization().map_err(freerange_data::DataError::from)?);
-    }
     // Partial statistics are merged in the order of the objects, so that the result does not depend on threads.
     let parts = (0..count)
         .into_par_iter()

@@ -12,6 +12,9 @@ use freerange_mesh::{Lighting, Map, Material, Mesh, Picture, Scene, Texture, ren
 use glam::{DVec3, Vec2, Vec3};
 use image::{Rgba, RgbaImage};
 
+#[path = "../../../tools/machine.rs"]
+mod machine;
+
 fn object(triangles: usize) -> Mesh {
     let n = ((triangles as f32 / 4.0).sqrt() as usize).max(4);
     let point = |u: f32, v: f32| {
@@ -49,15 +52,6 @@ fn object(triangles: usize) -> Mesh {
     mesh
 }
 
-fn machine() -> String {
-    let info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    let cpu =
-        info.lines().find_map(|l| l.strip_prefix("model name")?.split(": ").nth(1)).unwrap_or("unknown processor");
-    let git = std::process::Command::new("git").args(["describe", "--always", "--dirty"]).output();
-    let commit = git.ok().filter(|o| o.status.success()).map(|o| String::from_utf8_lossy(&o.stdout).trim().to_string());
-    format!("{cpu}, 1 thread, commit {}", commit.as_deref().unwrap_or("unknown"))
-}
-
 fn milliseconds(time: Duration) -> f64 {
     1e3 * time.as_secs_f64()
 }
@@ -66,7 +60,7 @@ fn main() {
     let numbers: Vec<usize> = std::env::args().filter_map(|a| a.parse().ok()).collect();
     let triangles = numbers.first().copied().unwrap_or(30_000);
     let pixels = numbers.get(1).copied().unwrap_or(512) as u32;
-    println!("{}", machine());
+    println!("{}", machine::machine(1));
     println!("cargo bench -p freerange-mesh --bench render -- {triangles} {pixels}");
     let mesh = object(triangles);
     println!("{} triangles", mesh.triangles.len());

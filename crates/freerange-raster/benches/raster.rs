@@ -11,6 +11,9 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::time::{Duration, Instant};
 
+#[path = "../../../tools/machine.rs"]
+mod machine;
+
 /// `n` Gaussians on the surface, `[n, 14]`.
 fn scene(n: usize) -> Vec<f32> {
     let mut rng = ChaCha8Rng::seed_from_u64(1);
@@ -57,15 +60,6 @@ fn time(mut f: impl FnMut()) -> Duration {
     times[times.len() / 10]
 }
 
-fn machine() -> String {
-    let info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    let cpu =
-        info.lines().find_map(|l| l.strip_prefix("model name")?.split(": ").nth(1)).unwrap_or("unknown processor");
-    let git = std::process::Command::new("git").args(["describe", "--always", "--dirty"]).output();
-    let commit = git.ok().filter(|o| o.status.success()).map(|o| String::from_utf8_lossy(&o.stdout).trim().to_string());
-    format!("{cpu}, {} threads, commit {}", rayon::current_num_threads(), commit.as_deref().unwrap_or("unknown"))
-}
-
 fn main() {
     let (mut filter, mut args) = (String::new(), std::env::args().skip(1));
     while let Some(arg) = args.next() {
@@ -76,7 +70,7 @@ fn main() {
             filter = arg;
         }
     }
-    println!("{}", machine());
+    println!("{}", machine::machine(rayon::current_num_threads()));
     println!("{:32} {:>9} {:>9} {:>14} {:>14}", "", "fwd ms", "both ms", "fwd Mpair/s/c", "both Mpair/s/c");
     let config = RasterConfig::default();
     for n in [512, 1024, 2048, 8192, 50_000] {

@@ -112,7 +112,10 @@ pub(crate) fn write_ball(path: &Path) {
     );
     for r in 0..rings {
         for s in 0..sides {
-            let (t, p) = ((r as f32 + 0.1) / (rings as f32 - 0.8) * 3.14159, s as f32 / sides as f32 * 6.28318);
+            let (t, p) = (
+                (r as f32 + 0.1) / (rings as f32 - 0.8) * std::f32::consts::PI,
+                s as f32 / sides as f32 * std::f32::consts::TAU,
+            );
             let color = if (3..6).contains(&r) { "200 40 30" } else { "30 90 200" };
             text += &format!("{} {} {} {color}\n", t.sin() * p.cos(), t.sin() * p.sin(), t.cos());
         }
