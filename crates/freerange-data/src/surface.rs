@@ -11,17 +11,19 @@ use rand_chacha::ChaCha8Rng;
 pub struct SurfaceConfig {
     /// Surface points, the leaves of the tree.
     pub points: usize,
-    /// Standard deviation along the surface, in units of the square root of the area that a point stands for.
+    /// Standard deviation along the surface, in units of the square root of the area that a point stands for. Less leaves
+    /// holes between the points; more reaches beyond the silhouette, which is where most of the error is. Fits start
+    /// from wider ones, whatever this says.
     pub spread: f32,
     /// Standard deviation along the normal, in the same units.
     pub thickness: f32,
-    /// Opacity.
+    /// Opacity. Fits start from `fit.initial_opacity` instead.
     pub opacity: f32,
 }
 
 impl Default for SurfaceConfig {
     fn default() -> Self {
-        Self { points: 4096, spread: 0.65, thickness: 0.08, opacity: 0.95 }
+        Self { points: 4096, spread: 0.5, thickness: 0.04, opacity: 0.95 }
     }
 }
 

@@ -75,10 +75,22 @@ fn place(cloud: &mut Cloud, adam: &mut Adam, weights: &[f64], targets: &[usize],
     }
 }
 
+/// Variances times less than this move nothing that f32 could tell.
+const STILL: f64 = 1e-9;
+
 /// Moves each centre by `Sigma xi sigmoid(-100 (o - dead)) strength`, with `xi` standard normal: along the Gaussian's own
 /// shape, and only where it is faint. `strength` is the noise of the configuration times the centres' learning rate.
 pub(crate) fn add_noise(cloud: &mut Cloud, strength: f64, dead_opacity: f64, rng: &mut ChaCha8Rng) {
+    // Gaussians from this opacity on stay where they are, the most: nothing is drawn for them.
+    let still = dead_opacity + 0.01 * (strength / STILL).ln(); // -inf without noise
+    if still <= 0.0 {
+        return;
+    }
+    let still = if still < 1.0 { (still / (1.0 - still)).ln() as f32 } else { f32::INFINITY };
     for i in 0..cloud.len() {
+        if cloud.row(i)[channel::LOGIT_OPACITY] >= still {
+            continue;
+        }
         let xi = DVec3::from_array(std::array::from_fn(|_| rng.sample(StandardNormal)));
         let moved = cloud.mean(i) + noise(cloud, i, xi, strength, dead_opacity);
         cloud.as_mut_rows()[i][channel::MEAN].copy_from_slice(&moved.as_vec3().to_array());
@@ -87,8 +99,7 @@ pub(crate) fn add_noise(cloud: &mut Cloud, strength: f64, dead_opacity: f64, rng
 
 fn noise(cloud: &Cloud, i: usize, xi: DVec3, strength: f64, dead_opacity: f64) -> DVec3 {
     let gate = 1.0 / (1.0 + (100.0 * (cloud.opacity(i) - dead_opacity)).exp());
-    // Bright Gaussians, the most, need no covariance.
-    if gate * strength < 1e-12 { DVec3::ZERO } else { cloud.covariance(i) * (xi * (gate * strength)) }
+    cloud.covariance(i) * (xi * (gate * strength))
 }
 
 /// Rows of a cloud by index.
@@ -164,6 +175,25 @@ mod tests {
                 assert!((found[k] - f64::from(truth)).abs() <= tolerance, "{i}: {found} {truth}");
             }
         }
+    }
+
+    #[test]
+    fn only_faint_gaussians_move() {
+        let faint = [-9.0, -6.0, -4.0, -2.5];
+        let bright = [-0.5, 0.0, 2.0, 9.0];
+        let before = example(&[faint, bright].concat());
+        let mut cloud = before.clone();
+        add_noise(&mut cloud, 5e5 * 1.6e-4, 0.005, &mut ChaCha8Rng::seed_from_u64(5));
+        for i in 0..before.len() {
+            assert_eq!(cloud.row(i)[3..], before.row(i)[3..]);
+            // What is left out would not have moved by what f32 can tell.
+            let still = noise(&before, i, DVec3::ONE, 5e5 * 1.6e-4, 0.005).length() < 1e-9;
+            assert_eq!(still, i >= faint.len(), "{i}");
+            assert_eq!(cloud.row(i) == before.row(i), still, "{i}");
+        }
+        let moved = cloud.clone();
+        add_noise(&mut cloud, 0.0, 0.005, &mut ChaCha8Rng::seed_from_u64(5));
+        assert_eq!(cloud, moved);
     }
 
     #[test]

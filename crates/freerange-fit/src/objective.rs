@@ -23,19 +23,20 @@ impl Objective {
     ) -> Result<Self, FitError> {
         let cameras: Vec<_> = chosen.iter().map(|&i| targets.cameras[i]).collect();
         let output = render(cloud.rows(), &cameras, &vec![background; chosen.len()], &targets.raster)?;
-        let (width, height) = (targets.width, targets.height);
-        let parts: Vec<(f64, Vec<f32>)> = output
+        let size = targets.width * targets.height * 3;
+        let mut d_rgb = vec![0.0; output.rgb.len()]; // [views, h, w, 3]
+        let share = 1.0 / chosen.len() as f32;
+        let losses: Vec<f64> = output
             .rgb
-            .par_chunks(width * height * 3)
+            .par_chunks(size)
+            .zip(d_rgb.par_chunks_mut(size))
             .zip(chosen)
-            .map(|(image, &i)| {
-                photometric_loss(image, &targets.composite(i, background), width, height, lambda_ssim as f32)
+            .map(|((image, gradient), &i)| {
+                let target = targets.composite(i, background);
+                compare(image, &target, targets.width, lambda_ssim as f32, share, gradient)
             })
             .collect::<Result<_, _>>()?;
-        let share = 1.0 / chosen.len() as f32;
-        let loss = parts.iter().map(|(loss, _)| loss).sum::<f64>() / chosen.len() as f64;
-        let mut d_rgb: Vec<f32> = Vec::with_capacity(output.rgb.len()); // [views, h, w, 3]
-        parts.iter().for_each(|(_, gradient)| d_rgb.extend(gradient.iter().map(|g| g * share)));
+        let loss = losses.iter().sum::<f64>() / chosen.len() as f64;
         let gradients = render_backward(cloud.rows(), &output, &d_rgb, &[], &[])?.gaussians;
         Ok(Self { loss, gradients })
     }
@@ -45,12 +46,12 @@ impl Objective {
         if weight == 0.0 {
             return;
         }
-        let share = weight / cloud.len() as f64;
-        for (row, gradient) in cloud.iter().zip(self.gradients.as_chunks_mut::<{ channel::COUNT }>().0) {
-            let opacity = 1.0 / (1.0 + (-f64::from(row[channel::LOGIT_OPACITY])).exp());
-            self.loss += share * opacity;
-            gradient[channel::LOGIT_OPACITY] += (share * opacity * (1.0 - opacity)) as f32;
-        }
+        let share = (weight / cloud.len() as f64) as f32;
+        self.loss += each_row(cloud, &mut self.gradients, |row, gradient| {
+            let opacity = 1.0 / (1.0 + (-row[channel::LOGIT_OPACITY]).exp());
+            gradient[channel::LOGIT_OPACITY] += share * opacity * (1.0 - opacity);
+            share * opacity
+        });
     }
 
     /// Adds `weight` times the mean standard deviation.
@@ -58,14 +59,16 @@ impl Objective {
         if weight == 0.0 {
             return;
         }
-        let share = weight / (3 * cloud.len()) as f64;
-        for (row, gradient) in cloud.iter().zip(self.gradients.as_chunks_mut::<{ channel::COUNT }>().0) {
+        let share = (weight / (3 * cloud.len()) as f64) as f32;
+        self.loss += each_row(cloud, &mut self.gradients, |row, gradient| {
+            let mut sum = 0.0;
             for c in channel::LOG_SCALE {
-                let term = share * f64::from(row[c]).exp();
-                self.loss += term;
-                gradient[c] += term as f32;
+                let term = share * row[c].exp();
+                gradient[c] += term;
+                sum += term;
             }
-        }
+            sum
+        });
     }
 
     /// Adds the mean over the Gaussians of `sum_c weights_c (x_c - anchor_c)^2 / 2`. `weights` is `[n, 14]`.
@@ -84,34 +87,137 @@ impl Objective {
         if !self.loss.is_finite() {
             return refuse("the loss");
         }
-        if !self.gradients.iter().all(|g| g.is_finite()) {
+        if !finite(&self.gradients) {
             return refuse("a gradient");
         }
         Ok(())
     }
 }
 
+/// The loss of one image `[h, width, 3]` against its target; `share` times its gradient is written to `gradient`, which
+/// must be zero.
+///
+/// Only a rectangle is looked at: where both are plain background, they agree, and there the loss and its gradient are
+/// exactly zero. That holds as far as an SSIM window around a pixel sees no difference, and pixels whose windows do see
+/// one must see all of what is around it: two radii more than the differences reach.
+fn compare(
+    image: &[f32],
+    target: &[f32],
+    width: usize,
+    lambda_ssim: f32,
+    share: f32,
+    gradient: &mut [f32],
+) -> Result<f64, FitError> {
+    const MARGIN: usize = 10;
+    let height = image.len() / (3 * width);
+    let differ = |y: usize| {
+        let row = 3 * width * y..3 * width * (y + 1);
+        let (a, b) = (&image[row.clone()], &target[row]);
+        let unequal = |i: &usize| a[*i] != b[*i];
+        if a == b { None } else { Some(((0..a.len()).find(unequal)? / 3, (0..a.len()).rfind(unequal)? / 3)) }
+    };
+    let (mut left, mut right, mut top, mut bottom) = (width, 0, height, 0); // within these, inclusive
+    for (y, (first, last)) in (0..height).filter_map(|y| Some((y, differ(y)?))) {
+        (left, right, top, bottom) = (left.min(first), right.max(last), top.min(y), y);
+    }
+    if left > right {
+        return Ok(0.0);
+    }
+    let (x0, y0) = (left.saturating_sub(MARGIN), top.saturating_sub(MARGIN));
+    let (x1, y1) = ((right + 1 + MARGIN).min(width), (bottom + 1 + MARGIN).min(height));
+    let rows = || (y0..y1).map(|y| 3 * (y * width + x0)..3 * (y * width + x1));
+    let crop = |from: &[f32]| rows().flat_map(|row| from[row].iter().copied()).collect::<Vec<f32>>();
+    let (loss, part) = photometric_loss(&crop(image), &crop(target), x1 - x0, y1 - y0, lambda_ssim)?;
+    // Means over the rectangle, where means over the image are asked for.
+    let scale = part.len() as f64 / image.len() as f64;
+    for (row, part) in rows().zip(part.chunks_exact(3 * (x1 - x0))) {
+        gradient[row].iter_mut().zip(part).for_each(|(g, p)| *g = share * scale as f32 * p);
+    }
+    Ok(scale * loss)
+}
+
+/// Gaussians that one thread handles at a time.
+const TASK: usize = 1024 * channel::COUNT;
+
+/// Calls `f(row, gradient)` for every Gaussian, and sums what it returns, always in the same order.
+fn each_row(
+    cloud: &Cloud,
+    gradients: &mut [f32],
+    f: impl Fn(&[f32; channel::COUNT], &mut [f32; channel::COUNT]) -> f32 + Sync,
+) -> f64 {
+    let tasks = cloud.rows().par_chunks(TASK).zip(gradients.par_chunks_mut(TASK));
+    let sums = tasks.map(|(rows, gradients)| {
+        let rows = rows.as_chunks().0.iter().zip(gradients.as_chunks_mut().0);
+        rows.map(|(row, gradient)| f64::from(f(row, gradient))).sum()
+    });
+    sums.collect::<Vec<f64>>().iter().sum()
+}
+
+/// Whether all are: without a branch per number, unlike `all`, so that vectors of them are looked at.
+fn finite(values: &[f32]) -> bool {
+    const EXPONENT: u32 = 0x7f80_0000;
+    values.chunks(1024).all(|v| v.iter().fold(0, |any, v| any | u32::from(v.to_bits() & EXPONENT == EXPONENT)) == 0)
+}
+
 /// Refuses to go on with a cloud that is not finite.
 pub(crate) fn check_cloud(cloud: &Cloud, step: usize) -> Result<(), FitError> {
-    let finite = cloud.rows().iter().all(|v| v.is_finite());
-    if finite { Ok(()) } else { Err(FitError::Diverged { step, what: "a Gaussian" }) }
+    if finite(cloud.rows()) { Ok(()) } else { Err(FitError::Diverged { step, what: "a Gaussian" }) }
 }
 
 /// Gives every quaternion unit length, so that its learning rate means an angle.
 pub(crate) fn normalize_rotations(cloud: &mut Cloud) {
-    for row in cloud.iter_mut() {
-        let q = &mut row[channel::ROTATION];
-        let length = q.iter().map(|v| v * v).sum::<f32>().sqrt();
-        if length > 0.0 {
-            q.iter_mut().for_each(|v| *v /= length);
+    cloud.rows_mut().par_chunks_mut(TASK).for_each(|rows| {
+        for row in rows.as_chunks_mut::<{ channel::COUNT }>().0 {
+            let q = &mut row[channel::ROTATION];
+            let length = q.iter().map(|v| v * v).sum::<f32>().sqrt();
+            if length > 0.0 {
+                q.iter_mut().for_each(|v| *v /= length);
+            }
         }
-    }
+    });
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::tests::{ball, ring};
+
+    /// The rectangle of differences gives what the whole image gives.
+    #[test]
+    fn comparing_a_part_is_comparing_all() {
+        let (width, height, background) = (50, 40, 0.3f32);
+        // Differences inside, at two corners, and none.
+        for changed in [vec![(20, 17), (24, 12)], vec![(0, 0), (5, 3)], vec![(49, 39)], vec![]] {
+            let mut target = vec![background; width * height * 3];
+            for (i, v) in target.iter_mut().enumerate() {
+                let (x, y) = (i / 3 % width, i / 3 / width);
+                *v += if (18..28).contains(&x) && y < 20 { 0.1 * (i as f32).sin() } else { 0.0 };
+            }
+            let mut image = target.clone();
+            changed.iter().for_each(|(x, y)| image[3 * (y * width + x) + 1] += 0.4);
+            let (expected, all) = photometric_loss(&image, &target, width, height, 0.2).unwrap();
+            let mut found = vec![0.0; image.len()];
+            let loss = compare(&image, &target, width, 0.2, 0.5, &mut found).unwrap();
+            assert!((loss - expected).abs() < 1e-8, "{loss} {expected}");
+            let largest = all.iter().fold(0.0f32, |m, g| m.max(g.abs()));
+            assert!(if changed.is_empty() { found.iter().all(|g| *g == 0.0) } else { largest > 1e-5 });
+            for (found, all) in found.iter().zip(&all) {
+                // SSIM's own gradient at equal images is zero but for rounding.
+                assert!((2.0 * found - all).abs() <= 1e-4 * largest + 1e-8, "{found} {all}");
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_not_finite_is_found() {
+        let mut values = vec![f32::MAX; 3000];
+        assert!(finite(&values) && finite(&[]));
+        for (at, bad) in [(0, f32::NAN), (1500, f32::INFINITY), (2999, f32::NEG_INFINITY)] {
+            let before = std::mem::replace(&mut values[at], bad);
+            assert!(!finite(&values));
+            values[at] = before;
+        }
+    }
 
     /// All terms together, against central differences.
     #[test]

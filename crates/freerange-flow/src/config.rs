@@ -43,6 +43,8 @@ pub struct DataConfig {
     pub object: ObjectConfig,
     /// What shards keep of each object, and how objects are divided.
     pub shard: ShardConfig,
+    /// What objects in shards have that there is no time for on the fly.
+    pub build: BuildOverrides,
     /// Depths of the slices in shards, ascending; empty: those of the stages.
     pub depths: Vec<u32>,
     /// What mesh files may be like.
@@ -63,6 +65,7 @@ impl Default for DataConfig {
             shards: None,
             object: ObjectConfig::default(),
             shard: ShardConfig::default(),
+            build: BuildOverrides::default(),
             depths: Vec::new(),
             mesh: LoadLimits::default(),
             window: 64,
@@ -71,6 +74,16 @@ impl Default for DataConfig {
             statistics_objects: 256,
         }
     }
+}
+
+/// Fields of [`ObjectConfig`] that are different for objects in shards.
+#[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct BuildOverrides {
+    /// Views per object.
+    pub views: Option<usize>,
+    /// Gradient steps that adapt each slice to the views.
+    pub polish: Option<usize>,
 }
 
 /// The training loss (paper, Section 3.3).
@@ -235,11 +248,14 @@ impl TrainConfig {
     /// How shards for this training are made.
     pub fn build_config(&self) -> BuildConfig {
         let data = &self.data;
+        let mut object = data.object.clone();
+        object.views = data.build.views.unwrap_or(object.views);
+        object.polish = data.build.polish.unwrap_or(object.polish);
         BuildConfig {
             seed: self.seed,
             depths: if data.depths.is_empty() { self.depths() } else { data.depths.clone() },
             shard: data.shard.clone(),
-            object: data.object.clone(),
+            object,
             mesh: data.mesh.clone(),
         }
     }
@@ -252,6 +268,7 @@ impl TrainConfig {
         };
         self.model.validate()?;
         self.sample.validate()?;
+        self.data.object.validate()?;
         self.build_config().validate()?;
         check(!self.stages.is_empty(), "stage", "at least one [[stage]]", "none".into())?;
         for s in &self.stages {

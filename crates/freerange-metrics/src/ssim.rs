@@ -51,7 +51,7 @@ fn load(row: &[f32], at: usize) -> [f32; LANES] {
 }
 
 /// Blurs E[x], E[y], E[xx], E[yy], E[xy] down the rows around row `i`; `out` holds five padded rows.
-#[multiversion::multiversion(targets("x86_64+avx2+fma", "x86_64+avx512f+avx512vl+fma"))]
+#[multiversion::multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl+avx2+fma", "x86_64+avx2+fma"))]
 fn moments_down(x: &[f32], y: &[f32], length: usize, i: usize, weights: &[f32; TAPS], out: &mut [Vec<f32>; 5]) {
     let rows = x.len() / length;
     let (first, last) = (i.saturating_sub(RADIUS), (i + RADIUS).min(rows - 1));
@@ -76,7 +76,7 @@ fn moments_down(x: &[f32], y: &[f32], length: usize, i: usize, weights: &[f32; T
 }
 
 /// Blurs three maps `[rows, length]` down the rows around row `i`; `out` holds three padded rows.
-#[multiversion::multiversion(targets("x86_64+avx2+fma", "x86_64+avx512f+avx512vl+fma"))]
+#[multiversion::multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl+avx2+fma", "x86_64+avx2+fma"))]
 fn maps_down(maps: [&[f32]; 3], length: usize, i: usize, weights: &[f32; TAPS], out: &mut [Vec<f32>; 3]) {
     let rows = maps[0].len() / length;
     let (first, last) = (i.saturating_sub(RADIUS), (i + RADIUS).min(rows - 1));
@@ -96,7 +96,7 @@ fn maps_down(maps: [&[f32]; 3], length: usize, i: usize, weights: &[f32; TAPS], 
 }
 
 /// Blurs a padded row along itself, channel by channel.
-#[multiversion::multiversion(targets("x86_64+avx2+fma", "x86_64+avx512f+avx512vl+fma"))]
+#[multiversion::multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl+avx2+fma", "x86_64+avx2+fma"))]
 fn along(row: &[f32], weights: &[f32; TAPS], out: &mut [f32]) {
     for (b, target) in out.chunks_exact_mut(LANES).enumerate() {
         let mut sum = [0.0f32; LANES];
@@ -111,7 +111,7 @@ fn along(row: &[f32], weights: &[f32; TAPS], out: &mut [f32]) {
 }
 
 /// From blurred moments to similarity, and its derivatives by E[x], E[xx] and E[xy]; returns the row's sum.
-#[multiversion::multiversion(targets("x86_64+avx2+fma", "x86_64+avx512f+avx512vl+fma"))]
+#[multiversion::multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl+avx2+fma", "x86_64+avx2+fma"))]
 fn similarity(m: &[Vec<f32>; 5], by_x: &mut [f32], by_xx: &mut [f32], by_xy: &mut [f32]) -> f64 {
     let (c1, c2) = (C1 as f32, C2 as f32);
     let n = by_x.len();

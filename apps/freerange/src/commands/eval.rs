@@ -7,7 +7,7 @@ use std::{
 };
 
 use freerange_camera::{Scene, View};
-use freerange_fit::{FitConfig, fit};
+use freerange_fit::{FitConfig, Rates, fit};
 use freerange_splat::Cloud;
 use serde::Serialize;
 
@@ -210,6 +210,9 @@ fn fit_alone(inputs: &[View], args: &Args) -> Result<Cloud, CliError> {
         iterations: args.fit_iterations,
         render_size: Some(args.fit_size),
         seed: args.sampling.seed,
+        // Chosen for long fits that start from the hull of a few masks.
+        rates: Rates { mean: 1.5e-3, scale: 5e-3, ..FitConfig::default().rates },
+        final_mean_rate: 1.5e-5,
         ..FitConfig::default()
     };
     let mut bar = Progress::new("fitting", config.iterations as u64);

@@ -96,6 +96,9 @@ pub struct Settings {
     /// Iterations of the fit.
     #[arg(long)]
     iterations: Option<usize>,
+    /// Gradient steps that adapt each slice to the views; 0: slices are what the tree says.
+    #[arg(long)]
+    polish: Option<usize>,
     /// Objects per shard.
     #[arg(long)]
     objects_per_shard: Option<u64>,
@@ -126,11 +129,12 @@ impl Settings {
         if let Some(n) = self.leaves {
             object.surface.points = n;
             object.fit.max_gaussians = n;
-            object.fit.initial = object.fit.initial.min(n);
+            object.fit.initial = n;
         }
         object.views = self.views.unwrap_or(object.views);
         object.cameras.resolution = self.resolution.unwrap_or(object.cameras.resolution);
         object.fit.iterations = self.iterations.unwrap_or(object.fit.iterations);
+        object.polish = self.polish.unwrap_or(object.polish);
         config.shard.leaves |= self.keep_leaves;
         config.shard.objects_per_shard = self.objects_per_shard.unwrap_or(config.shard.objects_per_shard);
         config.shard.min_psnr = self.min_psnr.unwrap_or(config.shard.min_psnr);

@@ -18,9 +18,6 @@ pub struct Args {
     /// Numbers of Gaussians, powers of two up to --leaves.
     #[arg(long, value_delimiter = ',', default_values_t = [256usize, 1024])]
     counts: Vec<usize>,
-    /// Gradient steps for the polished slices; 0 leaves them out.
-    #[arg(long, default_value_t = 0)]
-    polish: usize,
     /// Measure only this many objects, evenly spread.
     #[arg(long)]
     objects: Option<u64>,
@@ -32,8 +29,7 @@ pub struct Args {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
     let items = args.input.items()?.spread(args.objects.unwrap_or(u64::MAX));
-    let mut config = args.settings.build_config(Some(GaussianSource::Fit))?;
-    config.object.polish = args.polish;
+    let config = args.settings.build_config(Some(GaussianSource::Fit))?;
     let mut bar = Progress::new("measuring", items.len());
     let mut table: Vec<Quality> = Vec::new();
     let mut lines = String::new();
