@@ -69,7 +69,7 @@ impl InputArgs {
 /// How objects are made and stored.
 #[derive(clap::Args)]
 pub struct Settings {
-    /// Configuration whose [data] is used: tiny, base, paper, or a file.
+    /// Configuration whose table `data` is used: tiny, base, paper, or a file.
     #[arg(long, default_value = "tiny")]
     config: PathBuf,
     /// Seed of what is drawn for the objects: cameras, light, fits, splits.
