@@ -5,12 +5,13 @@ use std::collections::BTreeMap;
 use freerange_splat::{Cloud, Normalization, channel};
 use image::{Rgb, RgbImage, RgbaImage};
 use rayon::prelude::*;
+use sha2::{Digest, Sha256};
 
 use crate::items::{Input, count};
 use crate::manifest::{Failure, Manifest};
 use crate::quality::{over_white, render_over_white};
 use crate::shards::{check_size, read_object};
-use crate::store::{Store, sha256};
+use crate::store::{Store, hex};
 use crate::{DataError, Object};
 
 /// What [`inspect`] finds in a folder.
@@ -68,13 +69,16 @@ pub fn inspect(store: &Store, verify: bool) -> Result<Report, DataError> {
     if verify {
         manifest.shards.iter().try_for_each(|shard| {
             let name = shard.name();
-            let whole = store.range(&name, 0, shard.bytes)?;
-            let found = sha256(&whole);
+            let mut hash = Sha256::new();
+            store.pieces(&name, shard.bytes, |piece| {
+                hash.update(piece);
+                Ok(())
+            })?;
+            let found = hex(&hash.finalize());
             if found != shard.sha256 {
                 let problem = format!("expected SHA-256 {} as in the manifest, found {found}", shard.sha256);
                 return Err(DataError::File { path: store.path(&name), problem });
             }
-            drop(whole);
             shard.objects.par_iter().try_for_each(|object| {
                 let entries = read_object(store, &name, object)?;
                 entries.metadata()?;

@@ -42,6 +42,13 @@ impl fmt::Debug for Remote {
     }
 }
 
+/// What reading a whole file gives.
+pub(crate) enum Whole {
+    Here(Vec<u8>),
+    TooLarge,
+    Missing,
+}
+
 impl Remote {
     /// Opens a URL. Options come from the environment as `object_store` documents them (`AWS_*`, `GOOGLE_*`), which are
     /// those of the providers' own programs.
@@ -86,6 +93,19 @@ impl Remote {
             match self.store.head(&key).await {
                 Ok(meta) => Ok(Some(meta.size)),
                 Err(object_store::Error::NotFound { .. }) => Ok(None),
+                Err(e) => Err(e),
+            }
+        })
+    }
+
+    /// The whole of `name`, if it has at most `most` bytes.
+    pub fn read(&self, name: &str, most: u64) -> Result<Whole, DataError> {
+        let key = self.key(name);
+        self.wait(name, async {
+            match self.store.get(&key).await {
+                Ok(found) if found.meta.size > most => Ok(Whole::TooLarge),
+                Ok(found) => Ok(Whole::Here(found.bytes().await?.into())),
+                Err(object_store::Error::NotFound { .. }) => Ok(Whole::Missing),
                 Err(e) => Err(e),
             }
         })
@@ -213,6 +233,7 @@ mod tests {
         assert_eq!(far.list("parts/shard-00000").unwrap(), Vec::<String>::new());
         assert_readable(far, &here);
         assert!(far.range("plan.json", 1 << 20, 5).is_err());
+        assert!(far.read("plan.json", 10).unwrap_err().to_string().contains("at most 10 bytes"));
         assert_eq!((far.size("none").unwrap(), far.read("none", 5).unwrap()), (None, None));
     }
 

@@ -9,6 +9,8 @@ use std::path::{Path, PathBuf};
 use sha2::{Digest, Sha256};
 
 use crate::DataError;
+#[cfg(feature = "cloud")]
+use crate::remote::Whole;
 
 /// What follows the name of a local file that is being written.
 pub(crate) const PARTIAL: &str = ".partial";
@@ -108,10 +110,11 @@ impl Store {
                 if bytes.len() as u64 > most { Err(too_large()) } else { Ok(Some(bytes)) }
             }
             #[cfg(feature = "cloud")]
-            Place::Remote(remote) => {
-                let Some(size) = remote.size(name)? else { return Ok(None) };
-                if size > most { Err(too_large()) } else { remote.range(name, 0, size).map(Some) }
-            }
+            Place::Remote(remote) => match remote.read(name, most)? {
+                Whole::Here(bytes) => Ok(Some(bytes)),
+                Whole::TooLarge => Err(too_large()),
+                Whole::Missing => Ok(None),
+            },
         }
     }
 
@@ -135,6 +138,23 @@ impl Store {
             #[cfg(feature = "cloud")]
             Place::Remote(remote) => remote.range(name, offset, length),
         }
+    }
+
+    /// Hands the first `length` bytes of `name` over, piece by piece: files may be larger than memory.
+    ///
+    /// # Errors
+    /// [`DataError::Io`], also where the file ends before; those of `take`.
+    pub(crate) fn pieces(
+        &self,
+        name: &str,
+        length: u64,
+        mut take: impl FnMut(&[u8]) -> Result<(), DataError>,
+    ) -> Result<(), DataError> {
+        const PIECE: u64 = 8 << 20;
+        (0..length.div_ceil(PIECE)).try_for_each(|i| {
+            let at = i * PIECE;
+            take(&self.range(name, at, PIECE.min(length - at))?)
+        })
     }
 
     /// Size of `name` in bytes; `None` where there is no such file.
