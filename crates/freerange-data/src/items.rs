@@ -252,7 +252,8 @@ impl Ids {
         let stem = path.rsplit_once('.').map_or(path, |(stem, _)| stem);
         let plain: String =
             stem.chars().map(|c| if c.is_ascii_alphanumeric() || c == '_' || c == '-' { c } else { '-' }).collect();
-        let mut id = plain.clone();
+        let plain = plain.trim_matches('-');
+        let mut id = plain.to_owned();
         if id.is_empty() || id.len() > MAX_ID || self.0.contains(&id) {
             let digest = sha256(path.as_bytes());
             id = format!("{}-{}", &plain[..plain.len().min(MAX_ID - 17)], &digest[..16]);
@@ -317,6 +318,7 @@ mod tests {
         let (a, b) = (items.get(0).unwrap(), items.get(1).unwrap());
         assert_eq!((a.id.as_str(), a.licence.as_str(), a.split), ("m-a", "MIT", Some(Split::Test)));
         assert_eq!(a.file.unwrap(), folder.path().join("m/a.glb"));
+        assert_eq!(Ids::default().name("/a/b c.ply"), "a-b-c");
         assert_eq!((b.id.as_str(), b.licence.as_str(), b.file.unwrap()), ("bee", "unknown", "/b.ply".into()));
         for (text, named) in [
             ("", "found none"),
