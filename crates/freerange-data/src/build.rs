@@ -3,13 +3,13 @@
 //! An object is a pure function of its item, the configuration and the seed. Each finished object is written at once to
 //! `parts/`; when all objects of a shard are there, they become the shard, then its record, and the parts go away.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::io::Write;
 use std::panic::AssertUnwindSafe;
 use std::path::Path;
 use std::str::FromStr;
-use std::sync::Mutex;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
 use freerange_camera::{SelectionConfig, View, ViewSets, select_views};
@@ -153,14 +153,13 @@ pub(crate) fn build_with(
         make: &make,
     };
     let mut summary = Summary::default();
-    for shard in mine() {
-        let record = work.shard(shard)?;
+    for record in work.shards(mine().collect())? {
         summary.shards += 1;
         summary.bytes += record.bytes;
         summary.flagged.extend(record.objects.iter().filter(|o| o.flagged).map(|o| o.id.clone()));
         summary.failures.extend(record.failures);
     }
-    let totals = work.totals.into_inner().unwrap_or_else(|e| e.into_inner());
+    let totals = unpoisoned(work.totals.into_inner());
     summary.made = totals.made;
     summary.skipped = all - totals.made - totals.failed;
     let each = 1.0 / totals.made.max(1) as f64;
@@ -173,6 +172,7 @@ pub(crate) fn build_with(
     let names = store.list("")?;
     if (0..plan.shard_count()).all(|s| names.binary_search(&record_name(s)).is_ok()) {
         summary.complete = merge(&store)?.is_complete();
+        store.remove_folder(PARTS)?;
     }
     Ok(summary)
 }
@@ -345,6 +345,28 @@ struct Totals {
     psnr: HeldOutPsnr,
 }
 
+/// What is to be done.
+#[derive(Default)]
+struct Queue {
+    /// Shards that were not looked at yet.
+    shards: VecDeque<u64>,
+    /// Objects to make: shard, number, and how many of the shard's are left.
+    objects: VecDeque<(u64, u64, Arc<AtomicUsize>)>,
+}
+
+/// What is there of a shard.
+enum Scan {
+    /// All of it.
+    Whole(ShardRecord),
+    /// All but these objects, and the shard itself.
+    Missing(Vec<u64>),
+}
+
+/// What a lock holds, also where a thread has panicked with it: nothing is left half-changed here.
+fn unpoisoned<T>(lock: Result<T, PoisonError<T>>) -> T {
+    lock.unwrap_or_else(PoisonError::into_inner)
+}
+
 struct Work<'a, P, M> {
     plan: &'a Plan,
     plan_sha256: String,
@@ -364,8 +386,60 @@ where
     P: Fn(Done) + Sync,
     M: Fn(&Item) -> Result<(Made, FileFacts), DataError> + Sync,
 {
-    /// Makes what is missing of a shard.
-    fn shard(&self, shard: u64) -> Result<ShardRecord, DataError> {
+    /// Makes what is missing of some shards, by all workers. The first error of the store ends it.
+    ///
+    /// Workers go on with the next shard while others finish the last objects of one; who makes a shard's last object
+    /// also joins it.
+    fn shards(&self, shards: Vec<u64>) -> Result<Vec<ShardRecord>, DataError> {
+        let queue = Mutex::new(Queue { shards: shards.into(), ..Queue::default() });
+        let (records, failed) = (Mutex::new(BTreeMap::new()), Mutex::new(None));
+        let stop = AtomicBool::new(false);
+        let keep = |record: ShardRecord| unpoisoned(records.lock()).insert(record.index, record);
+        let work = |pool: &rayon::ThreadPool| -> Result<(), DataError> {
+            while !stop.load(Ordering::Relaxed) {
+                let next = {
+                    let mut queue = unpoisoned(queue.lock());
+                    while queue.objects.is_empty()
+                        && let Some(shard) = queue.shards.pop_front()
+                    {
+                        match self.scan(shard)? {
+                            Scan::Whole(record) => drop(keep(record)),
+                            Scan::Missing(objects) if objects.is_empty() => drop(keep(self.join(shard)?)),
+                            Scan::Missing(objects) => {
+                                let left = Arc::new(AtomicUsize::new(objects.len()));
+                                queue.objects.extend(objects.into_iter().map(|index| (shard, index, left.clone())));
+                            }
+                        }
+                    }
+                    queue.objects.pop_front()
+                };
+                let Some((shard, index, left)) = next else { break };
+                pool.install(|| self.make_one(shard, index))?;
+                if left.fetch_sub(1, Ordering::AcqRel) == 1 {
+                    keep(self.join(shard)?);
+                }
+            }
+            Ok(())
+        };
+        std::thread::scope(|scope| {
+            for pool in &self.pools {
+                let (work, stop, failed) = (&work, &stop, &failed);
+                scope.spawn(move || {
+                    if let Err(e) = work(pool) {
+                        stop.store(true, Ordering::Relaxed);
+                        unpoisoned(failed.lock()).get_or_insert(e);
+                    }
+                });
+            }
+        });
+        match unpoisoned(failed.into_inner()) {
+            Some(error) => Err(error),
+            None => Ok(unpoisoned(records.into_inner()).into_values().collect()),
+        }
+    }
+
+    /// What is there of a shard.
+    fn scan(&self, shard: u64) -> Result<Scan, DataError> {
         let old = ShardRecord::load(self.store, self.plan, &self.plan_sha256, shard)?;
         let whole = |r: &ShardRecord| Ok::<_, DataError>(self.store.size(&r.name())? == Some(r.bytes));
         if let Some(record) = old
@@ -376,7 +450,7 @@ where
             self.store.remove_folder(&parts(shard))?;
             record.objects.iter().for_each(|o| self.tell(&o.id, None));
             record.failures.iter().for_each(|f| self.tell(&f.id, None));
-            return Ok(record);
+            return Ok(Scan::Whole(record));
         }
         let folder = parts(shard);
         let there = self.store.list(&folder)?;
@@ -389,8 +463,7 @@ where
                 missing.push(index);
             }
         }
-        self.make_all(shard, &missing)?;
-        self.join(shard)
+        Ok(Scan::Missing(missing))
     }
 
     fn item(&self, index: u64) -> Result<Item, DataError> {
@@ -404,27 +477,6 @@ where
     fn tell(&self, id: &str, result: Option<Result<(&HeldOutPsnr, Seconds), &str>>) {
         let count = 1 + self.done.fetch_add(1, Ordering::Relaxed);
         (self.progress)(Done { count: [count, self.all], id, result });
-    }
-
-    /// Makes objects by all workers. The first error of the store ends it.
-    fn make_all(&self, shard: u64, missing: &[u64]) -> Result<(), DataError> {
-        let (next, stop, failed) = (AtomicU64::new(0), AtomicBool::new(false), Mutex::new(None));
-        std::thread::scope(|scope| {
-            for pool in &self.pools {
-                let (next, stop, failed) = (&next, &stop, &failed);
-                scope.spawn(move || {
-                    while let Some(&index) = missing.get(next.fetch_add(1, Ordering::Relaxed) as usize)
-                        && !stop.load(Ordering::Relaxed)
-                    {
-                        if let Err(e) = pool.install(|| self.make_one(shard, index)) {
-                            stop.store(true, Ordering::Relaxed);
-                            failed.lock().unwrap_or_else(|e| e.into_inner()).get_or_insert(e);
-                        }
-                    }
-                });
-            }
-        });
-        failed.into_inner().unwrap_or_else(|e| e.into_inner()).map_or(Ok(()), Err)
     }
 
     /// Makes an object and writes it to `parts/`. Fails only if it cannot be written.
@@ -447,7 +499,7 @@ where
                 let measured = psnr.is_some();
                 let psnr = psnr.unwrap_or_default();
                 {
-                    let mut totals = self.totals.lock().unwrap_or_else(|e| e.into_inner());
+                    let mut totals = unpoisoned(self.totals.lock());
                     totals.made += 1;
                     totals.seconds.add(&seconds, 1.0);
                     totals.measured += u64::from(measured);
@@ -459,7 +511,7 @@ where
             Err(reason) => {
                 tracing::warn!("object {index} ({}) could not be made: {reason}", item.id);
                 self.write_outcome(&folder, index, &Outcome::Failed { reason: reason.clone() })?;
-                self.totals.lock().unwrap_or_else(|e| e.into_inner()).failed += 1;
+                unpoisoned(self.totals.lock()).failed += 1;
                 self.tell(&item.id, Some(Err(&reason)));
             }
         }
@@ -552,10 +604,6 @@ where
         (record.bytes, record.sha256) = file.finish()?;
         self.store.write(&record_name(shard), &to_json(&record, self.store, &record_name(shard))?)?;
         self.store.remove_folder(&folder)?;
-        if let Some(root) = self.store.folder() {
-            // Only the last one finds it empty.
-            let _ = std::fs::remove_dir(root.join(PARTS));
-        }
         Ok(record)
     }
 }
