@@ -9,6 +9,8 @@ use super::build::{InputArgs, Settings, psnr_line, seconds_line};
 use crate::{error::CliError, progress::Progress};
 
 /// Say what building many objects will cost, from a few that are made.
+///
+/// `freerange data estimate generated` measures generated objects.
 #[derive(clap::Args)]
 pub struct Args {
     #[command(flatten)]
@@ -26,7 +28,7 @@ pub struct Args {
     json: bool,
 }
 
-/// Runs the command. An input called `generated` stands for generated objects.
+/// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
     let items = match args.input.is_generated() {
         true => Items::generated(args.objects.unwrap_or(args.sample).max(args.sample), 0),
