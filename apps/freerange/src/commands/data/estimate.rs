@@ -8,9 +8,7 @@ use freerange_data::{GaussianSource, Items, estimate};
 use super::build::{InputArgs, Settings, psnr_line, seconds_line};
 use crate::{error::CliError, progress::Progress};
 
-/// Say what building many objects will cost, from a few that are made.
-///
-/// `freerange data estimate generated` measures generated objects.
+/// Arguments of `data estimate`.
 #[derive(clap::Args)]
 pub struct Args {
     #[command(flatten)]

@@ -7,7 +7,7 @@ use freerange_mesh::{GalleryConfig, gallery};
 
 use crate::error::CliError;
 
-/// Draw a contact sheet of generated objects.
+/// Arguments of `data gallery`.
 #[derive(clap::Args)]
 pub struct Args {
     /// The PNG file to write.

@@ -6,7 +6,7 @@ use freerange_data::{ObjectSource, Shards, Store, contact_sheet, inspect};
 
 use crate::error::CliError;
 
-/// Say what shards hold.
+/// Arguments of `data inspect`.
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder or URL of shards.

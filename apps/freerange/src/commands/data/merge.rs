@@ -4,9 +4,7 @@ use freerange_data::{Store, collect, merge};
 
 use crate::error::CliError;
 
-/// Join what several processes or machines have built: writes the manifest once all shards are there.
-///
-/// Processes that share one output need no merge: whoever finishes last writes the manifest.
+/// Arguments of `data merge`.
 #[derive(clap::Args)]
 pub struct Args {
     /// Output of `data build` or `data generate`, where the manifest goes.

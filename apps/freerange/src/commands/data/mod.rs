@@ -18,15 +18,23 @@ pub enum Command {
     Build(build::Args),
     /// Make training objects from nothing and write them as shards.
     Generate(build::GenerateArgs),
-    /// Join what several processes or machines have built.
+    /// Join what several processes or machines have built: writes the manifest once all shards are there.
+    ///
+    /// Processes that share one output need no merge: whoever finishes last writes the manifest.
     Merge(merge::Args),
     /// Say what shards hold.
     Inspect(inspect::Args),
     /// Say what building many objects will cost, from a few that are made.
+    ///
+    /// `freerange data estimate generated` measures generated objects.
     Estimate(estimate::Args),
-    /// Compare fits, slices of the level-of-detail tree and points on the surface.
+    /// Compare fits of N Gaussians, slices of N from the level-of-detail tree of a larger fit, and points on the surface: PSNR
+    /// in dB on held-out views.
     Quality(quality::Args),
-    /// Render a mesh: posed images as `reconstruct` takes them.
+    /// Render a mesh, or each mesh of a folder: posed images as `reconstruct` takes them.
+    ///
+    /// The mesh is taken to the canonical frame first: +z up, its box centred, within radius 0.5. Where there are enough
+    /// views (20 by default), transforms_full.json, transforms_partial.json and transforms_val.json name those that `eval` uses.
     Views(views::Args),
     /// Draw a contact sheet of generated objects.
     Gallery(gallery::Args),

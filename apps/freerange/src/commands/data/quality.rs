@@ -7,8 +7,7 @@ use freerange_data::{GaussianSource, Quality, measure_quality};
 use super::build::{InputArgs, Settings};
 use crate::{error::CliError, progress::Progress};
 
-/// Compare fits of N Gaussians, slices of N from the level-of-detail tree of a larger fit, and points on the surface: PSNR in
-/// dB on held-out views.
+/// Arguments of `data quality`.
 #[derive(clap::Args)]
 pub struct Args {
     #[command(flatten)]

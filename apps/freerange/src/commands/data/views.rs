@@ -8,10 +8,7 @@ use freerange_data::render_views;
 use super::build::{InputArgs, Settings};
 use crate::{error::CliError, output::OutputFolder, progress::Progress};
 
-/// Render a mesh, or each mesh of a folder: posed RGBA images with a transforms.json, as `reconstruct` takes them.
-///
-/// The mesh is taken to the canonical frame first: +z up, its box centred, within radius 0.5. Where there are enough views
-/// (20 by default), transforms_full.json, transforms_partial.json and transforms_val.json name those that `eval` uses.
+/// Arguments of `data views`.
 #[derive(clap::Args)]
 pub struct Args {
     #[command(flatten)]
