@@ -89,6 +89,8 @@ pub struct Summary {
     pub failures: Vec<Failure>,
     /// Objects of the share that are flagged as bad fits.
     pub flagged: Vec<String>,
+    /// Objects in the shards of the share.
+    pub objects: u64,
     /// Shards of the share.
     pub shards: u64,
     /// Their bytes.
@@ -156,6 +158,7 @@ pub(crate) fn build_with(
     for record in work.shards(mine().collect())? {
         summary.shards += 1;
         summary.bytes += record.bytes;
+        summary.objects += record.objects.len() as u64;
         summary.flagged.extend(record.objects.iter().filter(|o| o.flagged).map(|o| o.id.clone()));
         summary.failures.extend(record.failures);
     }
@@ -209,11 +212,12 @@ pub fn collect(store: &Store, other: &Store) -> Result<u64, DataError> {
         let name = record.name();
         let mut file = store.create(&name)?;
         other.pieces(&name, record.bytes, |piece| file.write_all(piece).map_err(io_error(&store.path(&name))))?;
-        let found = file.finish()?;
-        if found.1 != record.sha256 {
-            let problem = format!("expected SHA-256 {} as in its record, found {}", record.sha256, found.1);
+        let found = file.sha256();
+        if found != record.sha256 {
+            let problem = format!("expected SHA-256 {} as in its record, found {found}", record.sha256);
             return Err(DataError::File { path: other.path(&name), problem });
         }
+        file.finish()?;
         let record_name = record_name(record.index);
         store.write(&record_name, &to_json(record, store, &record_name)?)?;
         copied += 1;

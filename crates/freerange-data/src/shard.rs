@@ -5,7 +5,6 @@
 use std::collections::HashSet;
 use std::fs::File;
 use std::io::{BufReader, Cursor, Read, Seek, SeekFrom};
-use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use freerange_splat::Cloud;
@@ -182,13 +181,6 @@ impl ShardReader {
     /// Name of object number `i`, if there is one.
     pub fn id(&self, i: usize) -> Option<&str> {
         self.samples.get(i).map(|s| s.key.as_ref())
-    }
-
-    /// Bytes of object number `i` within the file, if there is one.
-    pub fn span(&self, i: usize) -> Option<Range<u64>> {
-        let s = self.samples.get(i)?;
-        let last = s.views.last()?;
-        Some(s.metadata.offset - BLOCK..last.offset + last.size.next_multiple_of(BLOCK))
     }
 
     /// Object number `i`, with its slices at `depths` only.

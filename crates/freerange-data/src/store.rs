@@ -311,6 +311,11 @@ enum Sink {
 }
 
 impl NewFile {
+    /// SHA-256 of what was written so far, in hexadecimal.
+    pub fn sha256(&self) -> String {
+        hex(&self.hash.clone().finalize())
+    }
+
     /// Makes the bytes permanent, then gives the file its name. Returns its size and SHA-256.
     pub fn finish(mut self) -> Result<(u64, String), DataError> {
         match self.sink.take() {

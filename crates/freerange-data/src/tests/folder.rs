@@ -204,6 +204,7 @@ fn interruptions_shares_and_threads_leave_no_trace() {
     assert_eq!((run(cut.path(), &workers).made, contents(cut.path()) == expected), (2, true));
 
     // Three processes, in any order; the last one writes the manifest.
+    assert_eq!(run(shared.path(), &one_of(7, 9)).shards, 0, "more processes than shards");
     for (index, complete) in [(2, false), (0, false), (1, true)] {
         assert_eq!(run(shared.path(), &one_of(index, 3)).complete, complete);
     }
@@ -225,6 +226,15 @@ fn folders_are_merged_exactly() {
     assert!(merge(&a_store).unwrap().is_complete());
     assert_eq!(contents(a.path()), contents(whole.path()));
     assert_eq!(collect(&a_store, &b_store).unwrap(), 0);
+
+    // A shard that is not what its record says is not taken over.
+    let c = tempfile::tempdir().unwrap();
+    let path = b.path().join("shard-00001.tar");
+    let mut bytes = std::fs::read(&path).unwrap();
+    bytes[600] ^= 1;
+    std::fs::write(&path, bytes).unwrap();
+    assert!(message(collect(&Store::local(c.path()), &b_store)).contains("SHA-256"));
+    assert_eq!(contents(c.path()).into_keys().collect::<Vec<_>>(), ["plan.json"]);
 
     let other = tempfile::tempdir().unwrap();
     let mut config = toy_config();

@@ -205,7 +205,8 @@ fn make(items: &Items, config: &BuildConfig, work: &Work) -> Result<(), CliError
     } else {
         print(&summary, &work.output, work.shard);
     }
-    match summary.made == 0 && summary.skipped == 0 {
+    // A share without shards is no failure: there may be more processes than shards.
+    match summary.objects == 0 && !summary.failures.is_empty() {
         true => Err(CliError::input("no object could be made")),
         false => Ok(()),
     }
