@@ -17,6 +17,11 @@ impl CliError {
         Self { source: source.into(), code: 2 }
     }
 
+    /// Something failed through no fault of the user's: exit code 1.
+    pub fn failure(source: impl Into<Box<dyn Error + Send + Sync>>) -> Self {
+        Self { source: source.into(), code: 1 }
+    }
+
     /// A file could not be read or written: exit code 2.
     pub fn file(path: &Path, source: impl fmt::Display) -> Self {
         Self::input(format!("{}: {source}", path.display()))

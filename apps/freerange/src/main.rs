@@ -1,6 +1,7 @@
 //! `freerange`: posed photos in, 3D Gaussians out.
 
 mod commands;
+mod device;
 mod error;
 mod output;
 mod pictures;
@@ -39,6 +40,8 @@ enum Command {
     /// Make and look at training data.
     #[command(subcommand)]
     Data(commands::data::Command),
+    /// List the devices that this program can compute on.
+    Devices(commands::devices::Args),
     /// Look at models.
     #[command(subcommand)]
     Model(commands::model::Command),
@@ -64,6 +67,7 @@ fn main() -> ExitCode {
         Command::Eval(args) => commands::eval::run(&args),
         Command::Train(args) => commands::train::run(&args),
         Command::Data(command) => commands::data::run(&command),
+        Command::Devices(args) => commands::devices::run(&args),
         Command::Model(command) => commands::model::run(&command),
     };
     match result {

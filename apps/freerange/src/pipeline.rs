@@ -66,7 +66,7 @@ pub fn run(
 
     let begin = Instant::now();
     let mut bar = Progress::new("sampling", options.sample.steps as u64);
-    let clouds = reconstruct(checkpoint, &canonical, &options.sample, &options.seeds, device, |step| {
+    let clouds = reconstruct(checkpoint, &[&canonical], &options.sample, &options.seeds, device, |step| {
         bar.at(step.index as u64, "");
     })?;
     bar.finish();
@@ -74,7 +74,7 @@ pub fn run(
 
     let begin = Instant::now();
     let mut samples = Vec::with_capacity(clouds.len());
-    for (&seed, plain) in options.seeds.iter().zip(clouds) {
+    for (&seed, plain) in options.seeds.iter().zip(clouds.into_iter().flatten()) {
         let refined = match options.refine {
             0 => plain.clone(),
             steps => {

@@ -1,24 +1,8 @@
-//! The device to compute on, and what a run cost.
+//! The machine, the checkpoint, and what a run cost.
 
 use burn::tensor::Device;
 
 use crate::error::CliError;
-
-/// Where to compute.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-pub enum DeviceName {
-    /// The best device of this build: the CPU.
-    Auto,
-    /// The CPU: all cores, SIMD; needs nothing installed.
-    Cpu,
-}
-
-impl DeviceName {
-    /// The device, without differentiation.
-    pub fn open(self) -> Device {
-        Device::flex()
-    }
-}
 
 /// Largest memory that this process has held, in bytes; none where the system does not tell.
 pub fn peak_memory() -> Option<u64> {
@@ -34,4 +18,23 @@ pub fn checkpoint(path: Option<&std::path::Path>, device: &Device) -> Result<fre
         Some(path) => freerange_model::Checkpoint::load(path, device)?,
         None => freerange_model::Checkpoint::from_bytes(SHIPPED, "the shipped checkpoint", device)?,
     })
+}
+
+/// The processor's name.
+pub fn processor() -> String {
+    let info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let name = info.lines().find_map(|l| l.strip_prefix("model name")?.split(": ").nth(1));
+    name.unwrap_or(std::env::consts::ARCH).trim().to_owned()
+}
+
+/// Bytes of main memory; none where the system does not tell.
+pub fn memory() -> Option<u64> {
+    let info = std::fs::read_to_string("/proc/meminfo").ok()?;
+    let line = info.lines().find_map(|l| l.strip_prefix("MemTotal:"))?;
+    line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib * 1024)
+}
+
+/// The commit that this program was built from; `-dirty` if files had been changed.
+pub fn commit() -> String {
+    env!("FREERANGE_COMMIT").to_owned()
 }

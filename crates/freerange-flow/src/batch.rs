@@ -18,7 +18,7 @@ use rand_distr::{Distribution, StandardNormal};
 use crate::{
     FlowError,
     config::{LossConfig, Stage},
-    photometric::Targets,
+    photometric::{Images, Targets},
 };
 
 /// The same view at most `size` pixels wide and high, aspect kept.
@@ -146,7 +146,7 @@ impl Batch {
         let at = |views: &[Vec<&View>], size: u32| {
             let small: Vec<Vec<View>> = views.iter().map(|o| o.iter().map(|v| shrink(v, size)).collect()).collect();
             let small: Vec<Vec<&View>> = small.iter().map(|o| o.iter().collect()).collect();
-            Targets::new(&small, &backgrounds, device)
+            Ok::<_, FlowError>(Images::new(&small, device)?.on(&backgrounds))
         };
         let shape = [b, n, channel::COUNT];
         Ok(Self {

@@ -158,6 +158,9 @@ pub struct OptimizerConfig {
     pub ema: f32,
     /// Arithmetic of the blocks' linear layers; weights and sums stay in 32 bits.
     pub compute: Compute,
+    /// Keep only the input of each block, and compute the block again for its gradient: a fraction of the memory for a
+    /// third more work.
+    pub recompute: bool,
 }
 
 impl Default for OptimizerConfig {
@@ -171,6 +174,7 @@ impl Default for OptimizerConfig {
             clip: 1.0,
             ema: 0.9999,
             compute: Compute::F32,
+            recompute: false,
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use freerange_camera::View;
-use freerange_model::Checkpoint;
+use freerange_model::{Checkpoint, Compute};
 use freerange_splat::{Cloud, channel};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -12,7 +12,7 @@ use crate::{
     FlowError,
     batch::{Conditioning, draw_background, shrink},
     coupling::Coupling,
-    photometric::{Photometric, Targets},
+    photometric::{Images, Photometric},
 };
 
 /// How to sample.
@@ -37,6 +37,8 @@ pub struct SampleConfig {
     pub background: Background,
     /// How the starting noise is grouped into tokens: as in training.
     pub coupling: Coupling,
+    /// Arithmetic of the transformer's blocks.
+    pub compute: Compute,
 }
 
 impl Default for SampleConfig {
@@ -50,6 +52,7 @@ impl Default for SampleConfig {
             gradient_size: 512,
             background: Background::Random,
             coupling: Coupling::Independent,
+            compute: Compute::F32,
         }
     }
 }
@@ -151,43 +154,47 @@ pub fn classifier_free(conditional: Tensor<3>, unconditional: Tensor<3>, scale: 
     unconditional.clone() + (conditional - unconditional).mul_scalar(scale)
 }
 
-/// Draws one sample of Gaussians per seed that fits the posed images. The whole of Section 3.5.
+/// Draws one sample of Gaussians per object and seed that fits the object's posed images. The whole of Section 3.5.
 ///
-/// `views` are in the canonical frame (object within radius 0.5 of the origin); so are the results. Samples of several
-/// seeds run as one batch. `progress` is told each step before it is taken.
+/// `objects` are the views of each object, as many for each, in its canonical frame (object within radius 0.5 of the
+/// origin); so are the results, `[objects][seeds]`. All samples run as one batch. `progress` is told each step before it
+/// is taken; on a GPU, steps are only queued by then, and nothing waits for them but the end.
 pub fn reconstruct(
     checkpoint: &Checkpoint,
-    views: &[View],
+    objects: &[&[View]],
     config: &SampleConfig,
     seeds: &[u64],
     device: &Device,
     mut progress: impl FnMut(&Step),
-) -> Result<Vec<Cloud>, FlowError> {
+) -> Result<Vec<Vec<Cloud>>, FlowError> {
     config.validate()?;
-    let model = &checkpoint.model;
-    let (b, n) = (seeds.len(), 1usize << config.depth.unwrap_or(checkpoint.depth));
-    let objects: Vec<Vec<&View>> = vec![views.iter().collect()];
+    let model = checkpoint.model.clone().with_compute(config.compute);
+    let (b, n) = (objects.len() * seeds.len(), 1usize << config.depth.unwrap_or(checkpoint.depth));
 
     // The images are encoded once; every sample and step shares the tokens.
-    let tokens = Conditioning::new(&objects, &checkpoint.config, device)?.encode(model); // [1, m, c]
-    let tokens = tokens.repeat_dim(0, b);
+    let views: Vec<Vec<&View>> = objects.iter().map(|o| o.iter().collect()).collect();
+    let tokens = Conditioning::new(&views, &checkpoint.config, device)?.encode(&model); // [objects, m, c]
+    let [_, m, c] = tokens.dims();
+    let tokens = tokens.unsqueeze_dim::<4>(1).repeat_dim(1, seeds.len()).reshape([b, m, c]);
     let both = Tensor::cat(vec![tokens.clone(), tokens.zeros_like()], 0);
 
     let photometric = Photometric::new(&checkpoint.normalization, device);
     let rms = Tensor::<1>::from_floats(checkpoint.gradient_rms, device).reshape([1, 1, channel::COUNT]);
-    let small: Vec<View> = views.iter().map(|v| shrink(v, config.gradient_size)).collect();
-    let small: Vec<Vec<&View>> = vec![small.iter().collect(); b];
+    let small: Vec<Vec<View>> =
+        objects.iter().map(|o| o.iter().map(|v| shrink(v, config.gradient_size)).collect()).collect();
+    let small: Vec<Vec<&View>> = small.iter().flat_map(|o| vec![o.iter().collect(); seeds.len()]).collect();
+    let images = Images::new(&small, device)?;
     // Everything random about a sample comes from its own seed, whatever else is in the batch.
     let mut noise = Vec::with_capacity(b * n * channel::COUNT);
     let mut backgrounds = vec![Vec::with_capacity(b); config.steps]; // [steps][b]
-    for &seed in seeds {
+    for &seed in objects.iter().flat_map(|_| seeds) {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut one: Vec<f32> = (0..n * channel::COUNT).map(|_| StandardNormal.sample(&mut rng)).collect();
         config.coupling.group(&mut one);
         noise.extend(one);
         backgrounds.iter_mut().for_each(|step| step.push(config.background.draw(&mut rng)));
     }
-    let targets = |index: usize| Targets::new(&small, &backgrounds[index], device);
+    let targets = |index: usize| images.on(&backgrounds[index]);
     let noise = Tensor::from_data(TensorData::new(noise, [b, n, channel::COUNT]), device);
 
     let mut previous: Option<Tensor<3>> = None;
@@ -200,7 +207,7 @@ pub fn reconstruct(
                     (GradientAt::Estimate, Some(estimate)) => estimate.clone(),
                     _ => step.z.clone(),
                 };
-                Some(scale_gradient(photometric.gradient(at, &targets(step.index)?)?, &rms))
+                Some(scale_gradient(photometric.gradient(at, &targets(step.index))?, &rms))
             }
         };
         let estimate = if config.guidance == 1.0 {
@@ -221,18 +228,19 @@ pub fn reconstruct(
         if config.photometric == 0.0 {
             return Ok(None);
         }
-        let gradient = photometric.gradient(estimate.clone(), &targets(step.index)?)?;
+        let gradient = photometric.gradient(estimate.clone(), &targets(step.index))?;
         Ok(Some(gradient.mul_scalar(config.photometric)))
     };
     let estimate = euler(noise, config.steps, estimate, push)?;
 
     let raw = photometric.denormalize(estimate).into_data().try_to_vec::<f32>().map_err(|_| FlowError::NoGradient)?;
-    let clouds = raw.chunks_exact(n * channel::COUNT).map(|rows| {
+    let cloud = |rows: &[f32]| {
         let mut cloud = Cloud::from_rows(rows.to_vec());
         cloud.canonicalize_rotations();
         cloud
-    });
-    Ok(clouds.collect())
+    };
+    let mut rows = raw.chunks_exact(n * channel::COUNT);
+    Ok(objects.iter().map(|_| rows.by_ref().take(seeds.len()).map(cloud).collect()).collect())
 }
 
 /// Largest magnitude of a gradient channel, in units of its root mean square: a few Gaussians have gradients

@@ -24,7 +24,7 @@ use crate::{
     config::TrainConfig,
     photometric::Photometric,
     train,
-    weights::{Weights, clip_global_norm},
+    weights::{Weights, global_norm, scale},
 };
 
 /// Decay of the running mean square of the photometric gradient.
@@ -209,25 +209,29 @@ impl Trainer {
 
         let rms = Tensor::<1>::from_floats(self.gradient_rms(), &self.device).reshape([1, 1, channel::COUNT]);
         let losses = train::step(&self.model, batch, &self.photometric, &rms, loss, &self.device)?;
-        let total = losses.total.clone().inner().into_scalar::<f32>();
+        let mut gradients = GradientsParams::from_grads(losses.total.clone().backward(), &self.model);
+        let norm = global_norm(&gradients, &self.model, &self.device);
+        // One transfer for all figures: each would wait for the device.
+        let mut figures = vec![losses.total.inner(), losses.flow, losses.seen, losses.held, norm];
+        figures.extend(losses.gradient_square);
+        let figures = Tensor::cat(figures, 0).into_data().try_to_vec::<f32>().map_err(|_| FlowError::NoGradient)?;
+        let (&[total, flow, seen, held, norm], square) = figures.split_first_chunk().ok_or(FlowError::NoGradient)?;
         self.require_finite("loss", total)?;
-        let mut gradients = GradientsParams::from_grads(losses.total.backward(), &self.model);
-        let o = &self.config.optimizer;
-        let norm = clip_global_norm(&mut gradients, &self.model, o.clip, &self.device);
         self.require_finite("norm of the gradients", norm)?;
+        let o = &self.config.optimizer;
+        if norm > o.clip {
+            scale(&mut gradients, &self.model, o.clip / norm);
+        }
         let rate = o.rate(index, self.config.total_steps());
         self.model = self.optimizer.step(rate, self.model.clone(), gradients);
 
         // The average follows closely at first, when the weights still move far.
         let decay = o.ema.min((1.0 + index as f32) / (10.0 + index as f32));
         self.average.average(&Weights::of(&self.model), decay);
-        if let Some(square) = losses.gradient_square {
-            let square = square.into_data().try_to_vec::<f32>().map_err(|_| FlowError::NoGradient)?;
-            // The mean of all steps so far until that is long enough to forget the oldest.
-            let decay = GRADIENT_STATISTIC_DECAY.min(index as f32 / (index as f32 + 1.0));
-            for (mine, new) in self.progress.gradient_square.iter_mut().zip(square) {
-                *mine = decay * *mine + (1.0 - decay) * new;
-            }
+        // The mean of all steps so far until that is long enough to forget the oldest.
+        let decay = GRADIENT_STATISTIC_DECAY.min(index as f32 / (index as f32 + 1.0));
+        for (mine, new) in self.progress.gradient_square.iter_mut().zip(square) {
+            *mine = decay * *mine + (1.0 - decay) * new;
         }
         let seconds = begin.elapsed().as_secs_f64();
         self.progress.step += 1;
@@ -235,9 +239,9 @@ impl Trainer {
         Ok(Report {
             step: self.progress.step,
             loss: total,
-            flow: losses.flow.into_scalar(),
-            seen: losses.seen.into_scalar(),
-            held: losses.held.into_scalar(),
+            flow,
+            seen,
+            held,
             gradient_norm: norm,
             learning_rate: rate,
             seconds,

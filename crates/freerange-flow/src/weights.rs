@@ -50,13 +50,8 @@ impl Weights {
     }
 }
 
-/// Scales all gradients so that their joint Euclidean norm is at most `limit`. Returns the norm before.
-pub(crate) fn clip_global_norm<M: Module>(
-    gradients: &mut GradientsParams,
-    module: &M,
-    limit: f32,
-    device: &Device,
-) -> f32 {
+/// The joint Euclidean norm of all gradients. `[1]`, on the device.
+pub(crate) fn global_norm<M: Module>(gradients: &GradientsParams, module: &M, device: &Device) -> Tensor<1> {
     struct Sum<'a>(&'a GradientsParams, Tensor<1>);
     impl ModuleVisitor for Sum<'_> {
         fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
@@ -65,6 +60,13 @@ pub(crate) fn clip_global_norm<M: Module>(
             }
         }
     }
+    let mut sum = Sum(gradients, Tensor::zeros([1], &device.clone().inner()));
+    module.visit(&mut sum);
+    sum.1.sqrt()
+}
+
+/// Multiplies all gradients by `factor`.
+pub(crate) fn scale<M: Module>(gradients: &mut GradientsParams, module: &M, factor: f32) {
     struct Scale<'a>(&'a mut GradientsParams, f32);
     impl ModuleVisitor for Scale<'_> {
         fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
@@ -73,12 +75,5 @@ pub(crate) fn clip_global_norm<M: Module>(
             }
         }
     }
-    let mut sum = Sum(gradients, Tensor::zeros([1], &device.clone().inner()));
-    module.visit(&mut sum);
-    let norm = sum.1.sqrt().into_scalar::<f32>();
-    // Written so that a norm that is not a number leaves the gradients alone: the caller stops on it.
-    if norm > limit {
-        module.visit(&mut Scale(gradients, limit / norm));
-    }
-    norm
+    module.visit(&mut Scale(gradients, factor));
 }

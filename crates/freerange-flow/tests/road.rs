@@ -7,6 +7,7 @@ use freerange_flow::{config::TrainConfig, sample::reconstruct, trainer::Trainer}
 use freerange_metrics::psnr;
 use freerange_model::Checkpoint;
 use freerange_raster::{RasterConfig, render};
+use freerange_splat::Cloud;
 
 /// A model that learns one object in about a minute.
 const ONE_OBJECT: &str = r#"
@@ -113,7 +114,7 @@ fn one_object_is_learned_sampled_and_rendered() {
     };
     let object = source.object(0).unwrap();
     let (inputs, unseen) = object.views.split_at(4);
-    let clouds = reconstruct(&checkpoint, inputs, &config.sample, &[5, 6], &device, |_| {}).unwrap();
+    let clouds = reconstruct(&checkpoint, &[inputs], &config.sample, &[5, 6], &device, |_| {}).unwrap().remove(0);
     assert_eq!(clouds.len(), 2);
     assert_ne!(clouds[0], clouds[1], "another seed is another sample");
 
@@ -127,9 +128,16 @@ fn one_object_is_learned_sampled_and_rendered() {
             "unseen views: {found:.2} dB, a white image {white:.2} dB, the Gaussians that were learned {target:.2} dB"
         );
     }
-    let again = reconstruct(&checkpoint, inputs, &config.sample, &[5], &device, |_| {}).unwrap();
-    let worst = again[0].rows().iter().zip(clouds[0].rows()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-    assert!(worst < 1e-2, "the same seed on its own gives the same sample, up to rounding: off by {worst}");
+
+    // Another batch: two objects (the second sees other views), one seed.
+    let both = reconstruct(&checkpoint, &[inputs, unseen], &config.sample, &[5], &device, |_| {}).unwrap();
+    let worst = |a: &Cloud, b: &Cloud| a.rows().iter().zip(b.rows()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    assert_eq!(both.iter().map(Vec::len).collect::<Vec<_>>(), [1, 1]);
+    let off = worst(&both[0][0], &clouds[0]);
+    assert!(off < 1e-2, "the same seed in another batch gives the same sample, up to rounding: off by {off}");
+    let alone = reconstruct(&checkpoint, &[unseen], &config.sample, &[5], &device, |_| {}).unwrap();
+    assert!(worst(&both[1][0], &alone[0][0]) < 1e-2);
+    assert_ne!(both[0][0], both[1][0]);
 }
 
 #[test]

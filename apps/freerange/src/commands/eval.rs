@@ -98,7 +98,7 @@ struct ObjectReport {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
     let scenes = find_scenes(args)?;
-    let device = args.sampling.device.open();
+    let device = args.sampling.device.open()?;
     let checkpoint = match args.method {
         Method::Model => Some(checkpoint(args.sampling.checkpoint.as_deref(), &device)?),
         _ => None,

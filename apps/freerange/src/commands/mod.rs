@@ -1,6 +1,7 @@
 //! One file per command: its arguments, and what it prints and writes.
 
 pub mod data;
+pub mod devices;
 pub mod eval;
 pub mod model;
 pub mod reconstruct;

@@ -5,10 +5,7 @@ use std::path::PathBuf;
 use freerange_flow::config::TrainConfig;
 use freerange_model::{ModelConfig, ModelInfo, Workload};
 
-use crate::{
-    error::CliError,
-    runtime::{self, DeviceName},
-};
+use crate::{error::CliError, runtime};
 
 /// Look at models.
 #[derive(clap::Subcommand)]
@@ -49,7 +46,7 @@ pub fn run(command: &Command) -> Result<(), CliError> {
     match command {
         Command::Info(args) => info(args),
         Command::Shrink(args) => {
-            let checkpoint = runtime::checkpoint(Some(&args.input), &DeviceName::Cpu.open())?;
+            let checkpoint = runtime::checkpoint(Some(&args.input), &burn::tensor::Device::flex())?;
             Ok(checkpoint.save_as(&args.output, freerange_model::Precision::F16)?)
         }
     }
@@ -64,7 +61,7 @@ fn info(args: &Info) -> Result<(), CliError> {
             (ModelConfig { image_size: stage.image_size, ..config.model }, stage.depth, stage.batch, None)
         }
         (file, _) => {
-            let c = runtime::checkpoint(file.as_deref(), &DeviceName::Cpu.open())?;
+            let c = runtime::checkpoint(file.as_deref(), &burn::tensor::Device::flex())?;
             (c.config, c.depth, 1, Some(c.provenance))
         }
     };

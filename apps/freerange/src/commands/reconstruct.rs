@@ -8,11 +8,12 @@ use freerange_splat::write_ply;
 use serde::Serialize;
 
 use crate::{
+    device::DeviceName,
     error::CliError,
     output::OutputFolder,
     pictures::{grid, on_white, render_view, to_picture, write_turntable},
     pipeline::{self, Options, Scores, score, to_user},
-    runtime::{DeviceName, checkpoint, peak_memory},
+    runtime::{checkpoint, peak_memory},
 };
 
 /// Reconstruct an object from posed images.
@@ -66,8 +67,8 @@ pub struct Sampling {
     /// Which way is up in the scene's frame.
     #[arg(long, value_enum, default_value = "z")]
     pub up: UpName,
-    /// Where to compute.
-    #[arg(long, value_enum, default_value = "auto")]
+    /// Where to compute: auto, cpu, or cuda, metal, vulkan, webgpu with a number if there are several, as in cuda:1.
+    #[arg(long, default_value = "auto")]
     pub device: DeviceName,
 }
 
@@ -146,7 +147,7 @@ struct Before {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
     let begin = Instant::now();
-    let device = args.sampling.device.open();
+    let device = args.sampling.device.open()?;
     let scene = Scene::load(&args.scene)?;
     let mut further = scene.further;
     if let Some(path) = &args.validate {

@@ -4,11 +4,7 @@ use std::{io::Write, path::PathBuf, time::Instant};
 
 use freerange_flow::{config::TrainConfig, trainer::Trainer};
 
-use crate::{
-    error::CliError,
-    progress::Progress,
-    runtime::{DeviceName, checkpoint},
-};
+use crate::{device::DeviceName, error::CliError, progress::Progress, runtime::checkpoint};
 
 /// Train a model. Run the same command again to go on where it was stopped.
 ///
@@ -29,15 +25,15 @@ pub struct Args {
     /// Steps between two saved states.
     #[arg(long, default_value_t = 250)]
     save_every: u64,
-    /// Where to compute.
-    #[arg(long, value_enum, default_value = "auto")]
+    /// Where to compute: auto, cpu, or cuda, metal, vulkan, webgpu with a number if there are several, as in cuda:1.
+    #[arg(long, default_value = "auto")]
     device: DeviceName,
 }
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
     let begin = Instant::now();
-    let device = args.device.open();
+    let device = args.device.open()?;
     let config = TrainConfig::load(&args.config)?;
     let total = config.total_steps();
     let initial = args.initial.as_deref().map(|path| checkpoint(Some(path), &device)).transpose()?;
