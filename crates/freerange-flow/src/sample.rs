@@ -19,8 +19,10 @@ use crate::{
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SampleConfig {
-    /// Euler steps from noise to data.
+    /// Steps from noise to data.
     pub steps: usize,
+    /// How they are taken.
+    pub solver: Solver,
     /// Make `2^depth` Gaussians; left out: as many as at the depth the model was trained at. Tokens carry no position,
     /// so that any number can be drawn, but sizes are those of the trained depth.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -45,6 +47,7 @@ impl Default for SampleConfig {
     fn default() -> Self {
         Self {
             steps: 50,
+            solver: Solver::Euler,
             depth: None,
             guidance: 2.0,
             photometric: 50.0,
@@ -114,37 +117,73 @@ impl Background {
     }
 }
 
-/// The state that [`euler`] hands to its callback before each step.
+/// How the flow is integrated. All start at pure noise and take uniform steps in time.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Solver {
+    /// First order, the paper's.
+    #[default]
+    Euler,
+    /// Second order: a step with the mean of the velocities at both its ends. Two evaluations of the network per step.
+    Heun,
+    /// Second order from the estimates of this step and the one before, as DPM-Solver++(2M) (Lu et al. 2022), but linear in
+    /// time instead of in the log of the signal-to-noise ratio, whose steps do not shrink near the data. One evaluation
+    /// per step.
+    Multistep,
+}
+
+/// The state that [`integrate`] hands to its callbacks.
 #[derive(Clone, Debug)]
 pub struct Step {
     /// Number of the step, from 0.
     pub index: usize,
-    /// Time before the step.
+    /// Time of `z`.
     pub t: f32,
-    /// The sample before the step. `[b, n, 14]`
+    /// The sample at that time. `[b, n, 14]`
     pub z: Tensor<3>,
 }
 
-/// Integrates the flow with `steps` uniform Euler steps: `z <- z + dt v - lambda grad`, `v = (z1_hat - z) / (1 - t)`.
+/// Integrates the flow `dz/dt = (z1_hat - z) / (1 - t)` from `noise` in `steps` uniform steps; after each, `z <- z - push`.
 ///
-/// `estimate` gives the guided estimate of the clean sample, `push` the photometric step `lambda grad` taken there
-/// (or nothing). Returns the last estimate, which is what the paper denormalises.
-pub fn euler(
+/// `estimate` gives the guided estimate z1_hat of the clean sample, `push` the photometric step `lambda grad` taken at the
+/// first estimate of each step (or nothing). Returns the last estimate, which is what the paper denormalises.
+pub fn integrate(
     noise: Tensor<3>,
     steps: usize,
+    solver: Solver,
     mut estimate: impl FnMut(&Step) -> Result<Tensor<3>, FlowError>,
     mut push: impl FnMut(&Step, &Tensor<3>) -> Result<Option<Tensor<3>>, FlowError>,
 ) -> Result<Tensor<3>, FlowError> {
-    let dt = 1.0 / steps as f32;
+    let time = |i: usize| i as f32 / steps as f32;
     let mut z = noise;
     let mut last = z.clone();
     for index in 0..steps {
-        let step = Step { index, t: index as f32 / steps as f32, z: z.clone() };
-        last = estimate(&step)?;
-        z = z.clone() + (last.clone() - z).mul_scalar(dt / (1.0 - step.t));
-        if let Some(push) = push(&step, &last)? {
-            z = z - push;
-        }
+        let (t, next) = (time(index), time(index + 1));
+        let share = 1.0 / (steps - index) as f32; // of the way from z to the estimate: (next - t) / (1 - t)
+        let step = Step { index, t, z: z.clone() };
+        let before = std::mem::replace(&mut last, estimate(&step)?);
+        // Where a straight line to `goal` is at the end of this step.
+        let towards = |goal: Tensor<3>| z.clone() + (goal - z.clone()).mul_scalar(share);
+        let moved = match solver {
+            // The velocity at the end of the last step would be one divided by zero.
+            Solver::Heun if index + 1 < steps => {
+                let end = Step { index, t: next, z: towards(last.clone()) };
+                let velocity = (last.clone() - z.clone()).mul_scalar(1.0 / (1.0 - t));
+                let at_end = (estimate(&end)? - end.z).mul_scalar(1.0 / (1.0 - next));
+                z + (velocity + at_end).mul_scalar((next - t) / 2.0)
+            }
+            // The flow is solved exactly for an estimate that goes on changing as it did since the step before.
+            Solver::Multistep if index > 0 => {
+                let (left, rest) = ((steps - index) as f32, (steps - index - 1) as f32); // 1 - t before and after, in steps
+                let logarithm = if rest > 0.0 { rest * (left / rest).ln() } else { 0.0 };
+                towards(last.clone()) + (last.clone() - before).mul_scalar(1.0 - logarithm)
+            }
+            _ => towards(last.clone()),
+        };
+        z = match push(&step, &last)? {
+            Some(push) => moved - push,
+            None => moved,
+        };
     }
     Ok(last)
 }
@@ -231,7 +270,7 @@ pub fn reconstruct(
         let gradient = photometric.gradient(estimate.clone(), &targets(step.index))?;
         Ok(Some(gradient.mul_scalar(config.photometric)))
     };
-    let estimate = euler(noise, config.steps, estimate, push)?;
+    let estimate = integrate(noise, config.steps, config.solver, estimate, push)?;
 
     let raw = photometric.denormalize(estimate).into_data().try_to_vec::<f32>().map_err(|_| FlowError::NoGradient)?;
     let cloud = |rows: &[f32]| {
@@ -250,4 +289,41 @@ const GRADIENT_LIMIT: f32 = 5.0;
 /// The gradient as the network sees it: every channel at unit root mean square, outliers cut.
 pub fn scale_gradient(gradient: Tensor<3>, rms: &Tensor<3>) -> Tensor<3> {
     (gradient / rms.clone()).clamp(-GRADIENT_LIMIT, GRADIENT_LIMIT)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Data drawn from a normal distribution of mean `M` and deviation `S`: the best estimate, and the whole flow, are
+    /// known.
+    const M: f32 = 0.7;
+    const S: f32 = 0.4;
+
+    fn error(solver: Solver, steps: usize) -> f32 {
+        let device = Device::flex();
+        let noise = Tensor::<3>::from_data([[[-1.5f32, -0.3, 0.4, 2.0]]], &device);
+        let mut calls = 0;
+        let estimate = |s: &Step| {
+            calls += 1;
+            let (t, rest) = (s.t, 1.0 - s.t);
+            Ok((s.z.clone() - t * M).mul_scalar(t * S * S / (t * t * S * S + rest * rest)) + M)
+        };
+        let found = integrate(noise.clone(), steps, solver, estimate, |_, _| Ok(None)).unwrap();
+        assert_eq!(calls, if solver == Solver::Heun { 2 * steps - 1 } else { steps });
+        let expected = noise.mul_scalar(S) + M;
+        (found - expected).abs().max().into_scalar()
+    }
+
+    #[test]
+    fn second_order_solvers_are_of_second_order() {
+        // Twice the steps: half the error, or a quarter. (The multistep solver begins with a step of first order, which
+        // takes long to be outweighed.)
+        for (solver, fall) in [(Solver::Euler, 1.9), (Solver::Heun, 3.7), (Solver::Multistep, 2.7)] {
+            let [coarse, fine] = [80, 160].map(|n| error(solver, n));
+            assert!(coarse / fine > fall && coarse > 1e-5, "{solver:?}: {coarse} {fine}");
+            assert!(solver == Solver::Euler || fine < 0.05 * error(Solver::Euler, 160), "{solver:?} {fine}");
+        }
+        assert_eq!(error(Solver::Multistep, 1), error(Solver::Euler, 1));
+    }
 }

@@ -5,7 +5,7 @@ use std::{collections::HashMap, path::PathBuf};
 use burn::tensor::{Device, Tensor, TensorData};
 use freerange_flow::{
     path::{TimeSchedule, flow_loss, interpolate, render_weight},
-    sample::{classifier_free, euler},
+    sample::{Solver, classifier_free, integrate},
 };
 use freerange_splat::{Cloud, Normalization};
 
@@ -107,9 +107,10 @@ fn euler_with_both_guidances_on_the_toy_model() {
         let mut trajectory = values(tensor::<2>(&v, "in/z0", &device));
         let noise: Tensor<3> = tensor::<2>(&v, "in/z0", &device).unsqueeze();
         let mut estimates = Vec::new();
-        let last = euler(
+        let last = integrate(
             noise,
             steps,
+            Solver::Euler,
             |step| {
                 if step.index > 0 {
                     trajectory.extend(values(step.z.clone()));

@@ -52,7 +52,7 @@ pub struct Sampling {
     /// Seed of the (first) sample.
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
-    /// Euler steps from noise to Gaussians [default: the checkpoint's].
+    /// Steps from noise to Gaussians [default: the checkpoint's].
     #[arg(long)]
     pub steps: Option<usize>,
     /// Make 2^DEPTH Gaussians [default: the depth of the level-of-detail tree that the checkpoint was trained at].
