@@ -49,7 +49,7 @@ pub struct Report {
     pub learning_rate: f64,
     /// Seconds that the step took.
     pub seconds: f64,
-    /// Of these, seconds spent waiting for objects and making tensors of them.
+    /// Of these, seconds spent waiting for objects and making tensors of them (for the next step; a GPU works meanwhile).
     pub data_seconds: f64,
 }
 
@@ -73,6 +73,7 @@ pub struct Trainer {
     photometric: Photometric,
     stream: Stream,
     window: VecDeque<Arc<Object>>,
+    ahead: Option<Result<Batch, FlowError>>, // of the next step
     folder: PathBuf,
 }
 
@@ -172,6 +173,7 @@ impl Trainer {
             progress: state,
             stream,
             window,
+            ahead: None,
             folder: folder.into(),
         })
     }
@@ -186,11 +188,9 @@ impl Trainer {
         &self.config
     }
 
-    /// Takes one step.
-    pub fn step(&mut self) -> Result<Report, FlowError> {
-        let begin = Instant::now();
-        let index = self.progress.step;
-        let stage = self.config.stage(index).clone();
+    /// The batch of step `index`, which must be the first or follow the one before.
+    fn draw(&mut self, index: u64) -> Result<Batch, FlowError> {
+        let stage = self.config.stage(index);
         let mut rng = step_rng(self.config.seed, index);
         let count = self.window.len();
         let chosen: Vec<Arc<Object>> = match stage.batch <= count {
@@ -200,17 +200,34 @@ impl Trainer {
         let model_config = ModelConfig { image_size: stage.image_size, ..self.config.model.clone() };
         let loss = &self.config.loss;
         let batch =
-            Batch::draw(&chosen, &stage, &model_config, loss, &self.progress.normalization, &mut rng, &self.device)?;
+            Batch::draw(&chosen, stage, &model_config, loss, &self.progress.normalization, &mut rng, &self.device)?;
         for _ in 0..self.config.data.fresh {
             self.window.push_back(Arc::new(self.stream.take_next()?));
             self.window.pop_front();
         }
-        let data_seconds = begin.elapsed().as_secs_f64();
+        Ok(batch)
+    }
+
+    /// Takes one step.
+    pub fn step(&mut self) -> Result<Report, FlowError> {
+        let begin = Instant::now();
+        let index = self.progress.step;
+        let batch = match self.ahead.take() {
+            Some(batch) => batch?,
+            None => self.draw(index)?,
+        };
+        let mut data_seconds = begin.elapsed().as_secs_f64();
 
         let rms = Tensor::<1>::from_floats(self.gradient_rms(), &self.device).reshape([1, 1, channel::COUNT]);
-        let losses = train::step(&self.model, batch, &self.photometric, &rms, loss, &self.device)?;
+        let losses = train::step(&self.model, batch, &self.photometric, &rms, &self.config.loss, &self.device)?;
         let mut gradients = GradientsParams::from_grads(losses.total.clone().backward(), &self.model);
         let norm = global_norm(&gradients, &self.model, &self.device);
+        // A GPU has only been told by now what to do: the next batch is made while it works.
+        if index + 1 < self.config.total_steps() {
+            let begin = Instant::now();
+            self.ahead = Some(self.draw(index + 1));
+            data_seconds += begin.elapsed().as_secs_f64();
+        }
         // One transfer for all figures: each would wait for the device.
         let mut figures = vec![losses.total.inner(), losses.flow, losses.seen, losses.held, norm];
         figures.extend(losses.gradient_square);
