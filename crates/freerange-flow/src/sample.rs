@@ -159,7 +159,7 @@ pub fn integrate(
     let mut last = z.clone();
     for index in 0..steps {
         let (t, next) = (time(index), time(index + 1));
-        let share = 1.0 / (steps - index) as f32; // of the way from z to the estimate: (next - t) / (1 - t)
+        let share = (1.0 / steps as f32) / (1.0 - t); // of the way from z to the estimate
         let step = Step { index, t, z: z.clone() };
         let before = std::mem::replace(&mut last, estimate(&step)?);
         // Where a straight line to `goal` is at the end of this step.
