@@ -9,13 +9,19 @@
 //! (ties in index order); a splat's opacity at a pixel is at most 0.99, and ignored below 1/255; blending stops before the
 //! splat that would take the transmittance to 1e-4 or below.
 //!
-//! * `rasterize` (feature `op`): the differentiable operation on tensors, many objects and views in one call.
+//! * `rasterize` (feature `op`): the differentiable operation on tensors, many objects and views in one call; with the
+//!   feature `gpu` and one that says how to reach the device (`cuda`, `metal`, `vulkan`, `webgpu`), also on GPUs.
 //! * [`render`], [`render_backward`]: the same on plain slices, without a tensor library.
 //! * [`mod@reference`]: slow, in f64, for tests.
+
+#[cfg(test)]
+extern crate self as freerange_raster; // the tests' scenes are also those of unit tests
 
 mod config;
 mod cpu;
 mod error;
+#[cfg(feature = "gpu")]
+mod gpu;
 #[cfg(feature = "op")]
 mod op;
 pub mod reference;

@@ -1,5 +1,7 @@
 //! The operation on Burn tensors.
 
+#[cfg(feature = "gpu")]
+use crate::gpu;
 use crate::{CHANNELS, RasterConfig, RasterError, cpu};
 use burn::backend::{
     Autodiff, Backend, Dispatch, Flex,
@@ -13,14 +15,31 @@ use burn::backend::{
     tensor::FloatTensor,
 };
 use burn::tensor::{DType, Tensor, TensorData};
+#[cfg(feature = "gpu")]
+use burn_cubecl::{CubeBackend, tensor::CubeTensor};
 use freerange_camera::Camera;
-use std::sync::{Arc, OnceLock};
+use std::{
+    any::Any,
+    sync::{Arc, OnceLock},
+};
 
 /// Renders `gaussians` `[objects, n, 14]` (channels as in [`crate`]) with `cameras[object][view]`, in front of
 /// `backgrounds[object][view]`. Returns `[objects, views, height, width, 4]`: colour over the background, and alpha.
 ///
 /// Differentiable once in `gaussians`. All objects have the same number of views, and all views the same size in pixels.
 /// What [`crate::render`] says about values that are not finite holds here as well; [`RasterConfig::depth`] is ignored.
+///
+/// # Devices
+/// On a CPU, the same input gives the same bytes. With the feature `gpu`, tensors may also be on a GPU; the call returns
+/// before the image is there. Images are then the same every time, but gradients only up to rounding: they are sums over
+/// tiles, which finish in any order. Both equal those of the CPU up to rounding, with rare exceptions at pixels where the
+/// opacity of a splat, or the transmittance, is within rounding of a limit.
+///
+/// Apart from images and gradients, a GPU needs 96 bytes per Gaussian and image, one bit per Gaussian, image and tile of
+/// 16 x 16 pixels, and 8 bytes per pixel. Beyond 512 MiB, images are drawn in groups, and prepared again for the gradient.
+///
+/// # Panics
+/// If the device's memory does not suffice for one image, or if it does not run 256 units per cube.
 ///
 /// # Errors
 /// As [`crate::render`], and if the shape or data type of `gaussians` is not as above. Views are counted through all objects.
@@ -29,6 +48,24 @@ pub fn rasterize(
     cameras: &[Vec<Camera>],
     backgrounds: &[Vec<[f32; 3]>],
     config: &RasterConfig,
+) -> Result<Tensor<5>, RasterError> {
+    run(
+        gaussians,
+        cameras,
+        backgrounds,
+        config,
+        #[cfg(feature = "gpu")]
+        gpu::Tuning::default(),
+    )
+}
+
+/// [`rasterize`], with a choice of how the GPU does it.
+pub(crate) fn run(
+    gaussians: Tensor<3>,
+    cameras: &[Vec<Camera>],
+    backgrounds: &[Vec<[f32; 3]>],
+    config: &RasterConfig,
+    #[cfg(feature = "gpu")] tuning: gpu::Tuning,
 ) -> Result<Tensor<5>, RasterError> {
     let found = gaussians.dims();
     let [objects, _, channels] = found;
@@ -50,27 +87,52 @@ pub fn rasterize(
     let (cameras, backgrounds) = (cameras.concat(), backgrounds.concat());
     let [width, height] = cpu::check(&[], &cameras, &backgrounds, config)?;
     let config = RasterConfig { depth: false, ..*config };
-    let job = Arc::new(Job { objects, views, width, height, cameras, backgrounds, config });
+    let job = Arc::new(Job {
+        objects,
+        views,
+        width,
+        height,
+        cameras,
+        backgrounds,
+        config,
+        #[cfg(feature = "gpu")]
+        tuning,
+    });
     Ok(Tensor::from_dispatch(Dispatch::rasterize(gaussians.into_dispatch(), job, None)))
 }
 
 /// What to render: plain data that travels through the backends.
 #[derive(Debug)]
 pub struct Job {
-    objects: usize,
-    views: usize,
-    width: usize,
-    height: usize,
-    cameras: Vec<Camera>,       // [objects * views]
-    backgrounds: Vec<[f32; 3]>, // [objects * views]
-    config: RasterConfig,
+    pub(crate) objects: usize,
+    pub(crate) views: usize,
+    pub(crate) width: usize,
+    pub(crate) height: usize,
+    pub(crate) cameras: Vec<Camera>,       // [objects * views]
+    pub(crate) backgrounds: Vec<[f32; 3]>, // [objects * views]
+    pub(crate) config: RasterConfig,
+    #[cfg(feature = "gpu")]
+    pub(crate) tuning: gpu::Tuning,
 }
 
-/// Where the forward pass puts what the backward pass needs, if somebody will want it.
-pub type Saved = Arc<OnceLock<cpu::State>>;
+/// Where the forward pass puts what the backward pass needs, if somebody will want it: the state of whichever backend.
+pub type Saved = Arc<OnceLock<Box<dyn Any + Send + Sync>>>;
+
+/// Notes the `state` of a forward pass.
+fn save(saved: Option<Saved>, state: impl Any + Send + Sync) {
+    if let Some(saved) = saved {
+        saved.set(Box::new(state)).expect("one forward pass per operation");
+    }
+}
+
+/// What the forward pass left, or, if it was not asked to, what it does now.
+fn saved_or<S: Any + Send + Sync>(saved: &Saved, forward: impl FnOnce() -> S) -> &S {
+    let state = saved.get_or_init(|| Box::new(forward()));
+    state.downcast_ref().expect("forward and backward pass on the same backend")
+}
 
 /// The backends that can rasterise.
-#[backend_extension(Flex, Autodiff)]
+#[backend_extension(Flex, Cube: cfg(feature = "gpu"), Autodiff)]
 pub trait RasterOps: Backend {
     /// `[objects, n, 14]` to `[objects, views, height, width, 4]`.
     fn rasterize(gaussians: FloatTensor<Self>, job: Arc<Job>, saved: Option<Saved>) -> FloatTensor<Self>;
@@ -106,19 +168,33 @@ impl Job {
 impl RasterOps for Flex {
     fn rasterize(gaussians: FlexTensor, job: Arc<Job>, saved: Option<Saved>) -> FlexTensor {
         let (image, state) = job.run(&gaussians);
-        if let Some(saved) = saved {
-            saved.set(state).expect("one forward pass per operation");
-        }
+        save(saved, state);
         FlexTensor::from_data(TensorData::new(image, [job.objects, job.views, job.height, job.width, 4]))
     }
 
     fn rasterize_backward(gaussians: FlexTensor, d_image: FlexTensor, job: Arc<Job>, saved: Saved) -> FlexTensor {
         let shape = [job.objects, gaussians.layout().shape()[1], CHANNELS];
-        let state = saved.get_or_init(|| job.run(&gaussians).1);
+        let state = saved_or(&saved, || job.run(&gaussians).1);
         let out = with_slice(&gaussians, |rows| {
             with_slice(&d_image, |d_image| cpu::backward(rows, state, d_image, 4, &[], &[]))
         });
         FlexTensor::from_data(TensorData::new(out.gaussians, shape))
+    }
+}
+
+#[cfg(feature = "gpu")]
+impl RasterOps for CubeBackend {
+    fn rasterize(gaussians: CubeTensor, job: Arc<Job>, saved: Option<Saved>) -> CubeTensor {
+        let (image, state) = gpu::forward(gaussians, &job, saved.is_some());
+        if let Some(state) = state {
+            save(saved, state);
+        }
+        image
+    }
+
+    fn rasterize_backward(gaussians: CubeTensor, d_image: CubeTensor, job: Arc<Job>, saved: Saved) -> CubeTensor {
+        let again = || gpu::forward(gaussians.clone(), &job, true).1.expect("it was asked to keep it");
+        gpu::backward(gaussians.clone(), d_image, &job, saved_or(&saved, again))
     }
 }
 

@@ -2,7 +2,7 @@
 
 mod common;
 
-use common::{camera, noise, scene};
+use common::{POISON, camera, noise, scene};
 use freerange_raster::{CHANNELS, RasterConfig, RasterError, reference, render, render_backward};
 use proptest::prelude::*;
 
@@ -144,43 +144,13 @@ fn what_does_not_fit_is_an_error() {
     assert!(render_backward(&gaussians, &out, &d_rgb, &[0.0; 64], &[]).is_ok());
 }
 
-/// Values that break careless code.
-fn poison() -> impl Strategy<Value = f32> {
-    let values = [
-        f32::NAN,
-        f32::INFINITY,
-        f32::NEG_INFINITY,
-        f32::MAX,
-        f32::MIN,
-        f32::MIN_POSITIVE,
-        1e-45,
-        0.0,
-        -0.0,
-        1e30,
-        -1e30,
-        1e20,
-        1e10,
-        -1e10,
-        1e5,
-        88.0,
-        60.0,
-        40.0,
-        20.0,
-        -20.0,
-        -88.0,
-        -1e5,
-        1e-20,
-    ];
-    proptest::sample::select(values.to_vec())
-}
-
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(400))]
 
     #[test]
     fn poison_neither_spreads_nor_panics(
         seed in 0u64..1000,
-        changes in proptest::collection::vec((0usize..12, 0usize..CHANNELS, poison()), 1..20),
+        changes in proptest::collection::vec((0usize..12, 0usize..CHANNELS, proptest::sample::select(POISON.to_vec())), 1..20),
     ) {
         let clean = scene(seed, 12);
         let mut gaussians = clean.clone();

@@ -3,7 +3,7 @@
 mod common;
 
 use burn::tensor::{Device, Tensor, TensorData};
-use common::{camera, noise, scene};
+use common::{camera, floats, noise, scene};
 use freerange_camera::Camera;
 use freerange_raster::{CHANNELS, RasterConfig, RasterError, rasterize, render, render_backward};
 
@@ -13,10 +13,6 @@ const H: u32 = 21;
 fn views() -> (Vec<Vec<Camera>>, Vec<Vec<[f32; 3]>>) {
     let cameras = [[0.0, 0.9], [0.3, 2.0]].map(|turns| turns.map(|t| camera(t, W, H)).to_vec()).to_vec();
     (cameras, vec![vec![[1.0; 3], [0.0, 0.5, 1.0]], vec![[0.3; 3], [0.1, 0.2, 0.3]]])
-}
-
-fn floats<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
-    tensor.into_data().try_to_vec::<f32>().unwrap()
 }
 
 #[test]

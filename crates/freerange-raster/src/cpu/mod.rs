@@ -6,7 +6,7 @@
 
 mod bin;
 mod math;
-mod project;
+pub(crate) mod project;
 mod tile;
 
 use crate::{CHANNELS, RasterConfig, RasterError};
