@@ -7,6 +7,7 @@ use std::{
 };
 
 use burn::tensor::Device;
+use freerange_model::Compute;
 use serde::Serialize;
 
 use crate::error::CliError;
@@ -146,6 +147,24 @@ impl DeviceName {
     }
 }
 
+/// `f32`, `bf16` or `f16`.
+pub fn parse_compute(text: &str) -> Result<Compute, String> {
+    serde_json::from_value(text.into()).map_err(|_| "expected f32, bf16 or f16".into())
+}
+
+/// Refuses arithmetic that a device does not have.
+pub fn require(compute: Compute, device: &Device) -> Result<(), CliError> {
+    match compute.supported(device) {
+        true => Ok(()),
+        false => {
+            let name = all().into_iter().find(|d| d.is(device)).map_or_else(|| "the device".into(), |d| d.name);
+            Err(CliError::input(format!(
+                "{name} cannot compute in {compute:?}: choose another --compute (see `freerange devices`)"
+            )))
+        }
+    }
+}
+
 /// What a device can do.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Properties {
@@ -229,7 +248,7 @@ fn ask(_: &Device) -> (Properties, bool) {
 fn ask(device: &Device) -> (Properties, bool) {
     use burn::backend::DispatchDevice;
     use burn::tensor::FloatDType;
-    use cubecl::ir::{AtomicUsage, ElemType, FloatKind, Type};
+    use cubecl::ir::{ElemType, FloatKind, Type, features::AtomicUsage};
     let DispatchDevice::Cube(cube) = device.as_dispatch() else { return (Properties::default(), false) };
     let client = cube.client();
     let p = client.properties();

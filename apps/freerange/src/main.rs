@@ -40,6 +40,8 @@ enum Command {
     /// Make and look at training data.
     #[command(subcommand)]
     Data(commands::data::Command),
+    /// Measure speed on a device.
+    Bench(commands::bench::Args),
     /// List the devices that this program can compute on.
     Devices(commands::devices::Args),
     /// Look at models.
@@ -67,6 +69,7 @@ fn main() -> ExitCode {
         Command::Eval(args) => commands::eval::run(&args),
         Command::Train(args) => commands::train::run(&args),
         Command::Data(command) => commands::data::run(&command),
+        Command::Bench(args) => commands::bench::run(&args),
         Command::Devices(args) => commands::devices::run(&args),
         Command::Model(command) => commands::model::run(&command),
     };

@@ -105,7 +105,8 @@ impl Trainer {
         };
         let tracked = plain.clone().autodiff();
         let mut model = FreeRange::new(&config.model, &mut step_rng(config.seed, u64::MAX), &tracked)?
-            .with_compute(config.optimizer.compute);
+            .with_compute(config.optimizer.compute)
+            .with_recompute(config.optimizer.recompute);
         let o = &config.optimizer;
         let mut optimizer = AdamWConfig::new()
             .with_weight_decay(o.weight_decay)
@@ -299,7 +300,7 @@ impl Trainer {
         std::fs::create_dir_all(&partial).map_err(io(&partial))?;
         let broken = |name: &str, e: String| FlowError::State { path: partial.join(name), problem: e };
         // Sampling chooses its own arithmetic.
-        let average = self.average.apply(self.model.clone().valid()).with_compute(Compute::F32);
+        let average = self.average.apply(self.model.clone().valid()).with_compute(Compute::F32).with_recompute(false);
         let model = self.model.clone().into_record();
         model.save(partial.join("model")).map_err(|e| broken("model", e.to_string()))?;
         let record = average.clone().into_record();

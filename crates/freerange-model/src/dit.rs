@@ -11,6 +11,7 @@ use burn::{
 use crate::{
     ModelConfig, ModelError,
     config::{CHANNELS, FinalLayer},
+    kernels::block::BlockSettings,
     layers::{Builder, Init, Linear, NormWeight, Source},
     ops::{self, Compute},
 };
@@ -27,6 +28,10 @@ pub struct Dit {
     gaussians_per_token: usize,
     gradient_channels: bool,
     time_features: usize,
+    #[module(skip)]
+    compute: Compute,
+    #[module(skip)]
+    recompute: bool,
 }
 
 #[derive(Module, Debug)]
@@ -35,8 +40,9 @@ struct TimeMlp {
     second: Linear,
 }
 
+/// One transformer block.
 #[derive(Module, Debug)]
-struct Block {
+pub(crate) struct Block {
     adaln: Linear,
     attn: Attention,
     ffn: FeedForward,
@@ -75,26 +81,98 @@ pub fn time_embedding(t: Tensor<1>, features: usize) -> Tensor<2> {
     Tensor::cat(vec![angle.clone().cos(), angle.sin()], 1)
 }
 
-impl Attention {
-    /// `x` `[b, t, d]`; the result only for the last `queries` tokens, `[b, queries, d]`.
-    fn forward(&self, x: Tensor<3>, queries: usize) -> Tensor<3> {
-        let qkv = self.qkv.forward(x); // [b, t, 3 d], rows ordered [3, heads, d / heads]
-        let mixed = ops::attention(qkv, self.q_norm.weight.val(), self.k_norm.weight.val(), self.heads, queries);
-        self.out.forward(mixed)
+impl Block {
+    pub(crate) fn build<S: Source>(
+        config: &ModelConfig,
+        name: &str,
+        builder: &mut Builder<'_, S>,
+    ) -> Result<Self, ModelError> {
+        let (d, f) = (config.hidden, config.ffn_width());
+        let name = |part: &str| format!("{name}.{part}");
+        Ok(Self {
+            adaln: builder.linear(&name("adaln"), d, 6 * d, Init::Zeros)?,
+            attn: Attention {
+                qkv: builder.linear(&name("attn.qkv"), d, 3 * d, Init::Xavier)?,
+                q_norm: builder.norm_weight(&name("attn.q_norm"), config.head_width())?,
+                k_norm: builder.norm_weight(&name("attn.k_norm"), config.head_width())?,
+                out: builder.linear(&name("attn.out"), d, d, Init::Xavier)?,
+                heads: config.heads,
+            },
+            ffn: FeedForward {
+                proj_in: builder.linear(&name("ffn.proj_in"), d, 2 * f, Init::Xavier)?,
+                proj_out: builder.linear(&name("ffn.proj_out"), f, d, Init::Xavier)?,
+            },
+        })
+    }
+
+    /// `x` `[b, t, d]`, `silu_c` `[b, d]`; returns the last `queries` tokens, `[b, queries, d]`.
+    pub(crate) fn forward(
+        &self,
+        x: Tensor<3>,
+        silu_c: Tensor<2>,
+        queries: usize,
+        compute: Compute,
+        recompute: bool,
+    ) -> Tensor<3> {
+        let Attention { qkv, q_norm, k_norm, out, heads } = &self.attn;
+        let FeedForward { proj_in, proj_out } = &self.ffn;
+        let settings = BlockSettings { heads: *heads, queries, compute, recompute };
+        let matrices = [&qkv.weight, &out.weight, &proj_in.weight, &proj_out.weight].map(|w| w.val());
+        let vectors = [&qkv.bias, &q_norm.weight, &k_norm.weight, &out.bias, &proj_in.bias, &proj_out.bias];
+        ops::dit_block(x, self.adaln.forward(silu_c), matrices, vectors.map(|w| w.val()), settings)
+    }
+
+    /// The weights of both norms of the attention.
+    pub(crate) fn norms(&self) -> [Tensor<1>; 2] {
+        [self.attn.q_norm.weight.val(), self.attn.k_norm.weight.val()]
+    }
+
+    /// The same as single operations, which say what a block computes.
+    pub(crate) fn forward_by_parts(&self, x: Tensor<3>, silu_c: Tensor<2>, queries: usize, parts: &Parts) -> Tensor<3> {
+        let [_, tokens, _] = x.dims();
+        let linear = |layer: &Linear, x: Tensor<3>| (parts.linear)(x, layer.weight.val(), layer.bias.val());
+        let [shift_a, scale_a, gate_a, shift_f, scale_f, gate_f] = chunks(self.adaln.forward(silu_c));
+        let Attention { qkv, q_norm, k_norm, out, heads } = &self.attn;
+        let y = linear(qkv, (parts.norm)(x.clone(), shift_a, scale_a)); // [b, t, 3 d]
+        let y = (parts.attention)(y, q_norm.weight.val(), k_norm.weight.val(), *heads, queries);
+        let x = if queries == tokens { x } else { x.narrow(1, tokens - queries, queries) };
+        let x = (parts.gated)(x, gate_a, linear(out, y));
+        let y = linear(&self.ffn.proj_in, (parts.norm)(x.clone(), shift_f, scale_f)); // [b, t, 2 ffn]
+        let y = linear(&self.ffn.proj_out, (parts.geglu)(y));
+        (parts.gated)(x, gate_f, y)
     }
 }
 
-impl Block {
-    /// `x` `[b, t, d]`, `silu_c` `[b, d]`; returns the last `queries` tokens, `[b, queries, d]`.
-    fn forward(&self, x: Tensor<3>, silu_c: Tensor<2>, queries: usize) -> Tensor<3> {
-        let [_, tokens, _] = x.dims();
-        let [shift_a, scale_a, gate_a, shift_f, scale_f, gate_f] = chunks(self.adaln.forward(silu_c));
-        let y = self.attn.forward(ops::modulated_norm(x.clone(), shift_a, scale_a), queries);
-        let x = if queries == tokens { x } else { x.narrow(1, tokens - queries, queries) };
-        let x = ops::gated_add(x, gate_a, y);
-        let y = self.ffn.proj_in.forward(ops::modulated_norm(x.clone(), shift_f, scale_f)); // [b, t, 2 ffn]
-        let y = self.ffn.proj_out.forward(ops::geglu(y));
-        ops::gated_add(x, gate_f, y)
+/// The operations of a block, one by one: fused ones, or their readable twins.
+pub(crate) struct Parts {
+    pub linear: fn(Tensor<3>, Tensor<2>, Tensor<1>) -> Tensor<3>,
+    pub norm: fn(Tensor<3>, Tensor<2>, Tensor<2>) -> Tensor<3>,
+    pub gated: fn(Tensor<3>, Tensor<2>, Tensor<3>) -> Tensor<3>,
+    pub geglu: fn(Tensor<3>) -> Tensor<3>,
+    pub attention: fn(Tensor<3>, Tensor<1>, Tensor<1>, usize, usize) -> Tensor<3>,
+}
+
+impl Parts {
+    /// The fused operations, in f32.
+    pub(crate) fn fused() -> Self {
+        Self {
+            linear: |x, w, b| ops::linear(x, w, b, Compute::F32),
+            norm: |x, shift, scale| ops::modulated_norm(x, shift, scale, Compute::F32),
+            gated: ops::gated_add,
+            geglu: ops::geglu,
+            attention: ops::attention,
+        }
+    }
+
+    /// Burn's own operations, in f32.
+    pub(crate) fn readable() -> Self {
+        Self {
+            linear: |x, w, b| ops::reference::linear(x, w, b, Compute::F32),
+            norm: ops::reference::modulated_norm,
+            gated: ops::reference::gated_add,
+            geglu: ops::reference::geglu,
+            attention: ops::reference::attention,
+        }
     }
 }
 
@@ -123,23 +201,7 @@ impl Dit {
                 second: builder.linear(&name("t_mlp.2"), d, d, Init::Normal(0.02))?,
             },
             blocks: (0..config.blocks)
-                .map(|i| {
-                    let name = |part: &str| format!("{prefix}blocks.{i}.{part}");
-                    Ok(Block {
-                        adaln: builder.linear(&name("adaln"), d, 6 * d, Init::Zeros)?,
-                        attn: Attention {
-                            qkv: builder.linear(&name("attn.qkv"), d, 3 * d, Init::Xavier)?,
-                            q_norm: builder.norm_weight(&name("attn.q_norm"), config.head_width())?,
-                            k_norm: builder.norm_weight(&name("attn.k_norm"), config.head_width())?,
-                            out: builder.linear(&name("attn.out"), d, d, Init::Xavier)?,
-                            heads: config.heads,
-                        },
-                        ffn: FeedForward {
-                            proj_in: builder.linear(&name("ffn.proj_in"), d, 2 * config.ffn_width(), Init::Xavier)?,
-                            proj_out: builder.linear(&name("ffn.proj_out"), config.ffn_width(), d, Init::Xavier)?,
-                        },
-                    })
-                })
+                .map(|i| Block::build(config, &format!("{prefix}blocks.{i}"), builder))
                 .collect::<Result<_, ModelError>>()?,
             output: Output {
                 adaln: match config.final_layer {
@@ -151,16 +213,24 @@ impl Dit {
             gaussians_per_token: config.gaussians_per_token,
             gradient_channels: config.gradient_channels,
             time_features: config.time_features,
+            compute: Compute::F32,
+            recompute: false,
         })
     }
 
-    /// How the blocks' linear layers are computed; the few others stay in f32.
+    /// In which precision the blocks compute; the few layers outside of them stay in f32.
     pub fn set_compute(&mut self, compute: Compute) {
-        for block in &mut self.blocks {
-            for linear in [&mut block.attn.qkv, &mut block.attn.out, &mut block.ffn.proj_in, &mut block.ffn.proj_out] {
-                linear.set_compute(compute);
-            }
-        }
+        self.compute = compute;
+    }
+
+    pub(crate) fn compute(&self) -> Compute {
+        self.compute
+    }
+
+    /// Whether blocks keep only their inputs for the gradient, and compute the rest again: a third more arithmetic,
+    /// for about a tenth of the activations.
+    pub fn set_recompute(&mut self, recompute: bool) {
+        self.recompute = recompute;
     }
 
     /// Width of the time's sinusoidal embedding.
@@ -208,7 +278,7 @@ impl Dit {
     #[cfg(test)]
     pub(crate) fn first_block(&self, tokens: Tensor<3>, t: Tensor<1>) -> Tensor<3> {
         let n = tokens.dims()[1];
-        self.blocks[0].forward(tokens, silu(self.condition(t)), n)
+        self.blocks[0].forward(tokens, silu(self.condition(t)), n, self.compute, self.recompute)
     }
 
     /// Predicts the clean Gaussians from noisy ones.
@@ -236,11 +306,11 @@ impl Dit {
         for (i, block) in self.blocks.iter().enumerate() {
             // Only Gaussian tokens leave the last block, so only they need computing there.
             let queries = if i + 1 == self.blocks.len() { gaussian_tokens } else { x.dims()[1] };
-            x = block.forward(x, silu_c.clone(), queries);
+            x = block.forward(x, silu_c.clone(), queries, self.compute, self.recompute);
         }
         if let Some(adaln) = &self.output.adaln {
             let [shift, scale] = chunks(adaln.forward(silu_c));
-            x = ops::modulated_norm(x, shift, scale);
+            x = ops::modulated_norm(x, shift, scale, Compute::F32);
         }
         self.output.linear.forward(x).reshape([b, n, CHANNELS])
     }

@@ -4,18 +4,24 @@
 //! `2 in out`, per head `4 tokens^2 width` for scores and mixing. The last block computes only Gaussian tokens beyond
 //! its keys and values. A training step costs three forward passes (four with recomputation of blocks).
 //!
-//! **Memory of a training step**, 4 bytes a number, `r` rows (= batch x tokens) of width `d`, inner width `f`, `h` heads:
-//! - weights, gradients, Adam's two moments: 4 numbers a trainable parameter, 1 a frozen one;
-//! - what a block keeps for its gradient: the two residual inputs (2 d), two normed inputs (2 d), `qkv` (3 d), mixed
-//!   values (d), attention and feed-forward outputs (2 d), the inner pair and its product (3 f), the softmax
-//!   denominators (h): `r (10 d + 3 f + h)` numbers;
-//! - with recomputation: each block's input, `r d`, and one block's full activations at a time.
+//! **Memory of a training step**, for `r` rows (= batch x tokens) of width `d`, inner width `f`, `h` heads; `q` of the
+//! rows leave the block (all but in the last block):
+//! - weights, gradients, Adam's two moments, moving average: 5 numbers a trainable parameter, 1 a frozen one, of 4 bytes;
+//! - what a block keeps for its gradient: its input (r d), the first normed input (r d), `qkv` (3 r d), mixed values and
+//!   the attention's output (2 q d), the second residual input (q d), normed (q d), the feed-forward output (q d), the
+//!   inner pair and its product (3 q f), the softmax denominators (q h). All have 4 bytes, but 2 on a GPU that computes in
+//!   half precision, where only residual inputs and denominators have 4;
+//! - with recomputation: each block's input alone;
+//! - what is there at once while one block goes backward, beyond what it keeps: gradients of the inner pair and of the
+//!   tokens; on a GPU also the queries, keys and values of all heads with their gradients and a piece of the scores; with
+//!   recomputation, all that the block would have kept.
 //!
-//! Score matrices are never held (see the attention kernel).
+//! Score matrices are never held whole (see the attention kernels). Left out: images, renders and the encoder's own
+//! activations, which are gone when the transformer's are largest, and what an allocator holds in reserve.
 
 use std::fmt;
 
-use crate::{Dinov2Config, EncoderConfig, FinalLayer, ModelConfig};
+use crate::{Compute, Dinov2Config, EncoderConfig, FinalLayer, ModelConfig};
 
 /// One tensor of the model.
 #[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
@@ -55,6 +61,17 @@ pub struct Workload {
     pub gaussians: usize,
 }
 
+/// How a training step is computed, as far as memory goes. The default is the CPU's, in f32.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
+pub struct Execution {
+    /// On a GPU, whose activations have the type of `compute`; on a CPU they are f32.
+    pub gpu: bool,
+    /// In which precision blocks compute.
+    pub compute: Compute,
+    /// Whether blocks keep only their inputs for the gradient.
+    pub recompute: bool,
+}
+
 /// Sizes and costs of a model.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
 pub struct ModelInfo {
@@ -72,12 +89,18 @@ pub struct ModelInfo {
     pub encoder_flops: f64,
     /// FLOPs of one pass of the transformer over the whole batch.
     pub forward_flops: f64,
-    /// Bytes of weights, gradients and Adam's moments.
+    /// What the bytes below are for.
+    pub execution: Execution,
+    /// Bytes of weights, gradients, Adam's moments and the moving average.
     pub state_bytes: u64,
     /// Bytes that the blocks keep for the gradient.
     pub activation_bytes: u64,
     /// The same where each block is computed again in the backward pass.
     pub recomputed_activation_bytes: u64,
+    /// Bytes that one block needs in the backward pass beyond those.
+    pub working_bytes: u64,
+    /// Bytes of a whole training step at its largest.
+    pub step_bytes: u64,
 }
 
 fn linear(out: &mut Vec<TensorInfo>, name: &str, inputs: usize, outputs: usize) {
@@ -131,8 +154,13 @@ pub fn dinov2_parameters(config: &Dinov2Config) -> u64 {
 }
 
 impl ModelInfo {
-    /// Computes everything for a valid configuration and a workload.
+    /// Computes everything for a valid configuration and a workload, on a CPU in f32.
     pub fn new(config: &ModelConfig, workload: Workload) -> Self {
+        Self::with_execution(config, workload, Execution::default())
+    }
+
+    /// Computes everything for a valid configuration, a workload and a way to compute it.
+    pub fn with_execution(config: &ModelConfig, workload: Workload, execution: Execution) -> Self {
         let tensors = tensors(config);
         let sum = |prefix: &str| tensors.iter().filter(|t| t.name.starts_with(prefix)).map(TensorInfo::count).sum();
         let (d, f) = (config.hidden, config.ffn_width());
@@ -173,10 +201,9 @@ impl ModelInfo {
 
         let trainable: u64 = tensors.iter().map(TensorInfo::count).sum();
         let tokens = config.tokens(workload.views, workload.gaussians);
-        let rows = (workload.batch * tokens) as u64;
-        let number = size_of::<f32>() as u64;
-        let block = rows * (10 * d + 3 * f + config.heads) as u64 * number;
-        let block_input = rows * d as u64 * number;
+        let memory = Memory::new(config, workload, execution);
+        let state_bytes = (5 * trainable + frozen) * F32;
+        let kept = if execution.recompute { memory.recomputed } else { memory.activations };
         Self {
             parts,
             trainable,
@@ -185,12 +212,59 @@ impl ModelInfo {
             tokens,
             encoder_flops: encoder_flops(config) * (workload.batch * workload.views) as f64,
             forward_flops: forward_flops(config, workload) * workload.batch as f64,
-            state_bytes: (4 * trainable + frozen) * number,
-            activation_bytes: blocks as u64 * block,
-            recomputed_activation_bytes: blocks as u64 * block_input + block,
+            execution,
+            state_bytes,
+            activation_bytes: memory.activations,
+            recomputed_activation_bytes: memory.recomputed,
+            working_bytes: memory.working,
+            step_bytes: state_bytes + kept + memory.working,
         }
     }
 }
+
+/// Bytes of a number.
+const F32: u64 = size_of::<f32>() as u64;
+
+/// Bytes of a training step's activations.
+struct Memory {
+    activations: u64,
+    recomputed: u64,
+    working: u64,
+}
+
+impl Memory {
+    fn new(config: &ModelConfig, workload: Workload, execution: Execution) -> Self {
+        let [d, f, h] = [config.hidden, config.ffn_width(), config.heads].map(|n| n as u64);
+        let tokens = config.tokens(workload.views, workload.gaussians);
+        let r = (workload.batch * tokens) as u64;
+        let last = (workload.batch * (workload.gaussians / config.gaussians_per_token)) as u64;
+        let half = execution.gpu && execution.compute != Compute::F32;
+        let number = if half { F32 / 2 } else { F32 };
+        let block = |q: u64| F32 * (r * d + q * d + q * h) + number * (r * 4 * d + q * (4 * d + 3 * f));
+        let blocks = config.blocks as u64;
+        let activations = if blocks == 0 { 0 } else { (blocks - 1) * block(r) + block(last) };
+        let recomputed = blocks * r * d * F32;
+        // While GEGLU goes backward, the product and the output are gone, and the gradients of the inner pair, of its
+        // product and of the tokens are there.
+        let feed_forward = F32 * r * d + number * r * (2 * f).saturating_sub(d);
+        let attention = if execution.gpu {
+            // Heads, their gradients, the gradients of qkv, of the mixed values and of the residual, a piece of scores.
+            let pair = r / (workload.batch as u64).max(1) * tokens as u64;
+            let scores = (pair * h * workload.batch as u64).min(SCORES) * (2 * F32 + 2 * number);
+            F32 * r * (3 * d + d) + number * r * (3 * d + 3 * d + 2 * d) + scores
+        } else {
+            F32 * r * (3 * d + 2 * d)
+        };
+        // The feed-forward network's tensors are gone when attention goes backward.
+        let freed = number * r * (2 * d + 3 * f) + F32 * r * d;
+        let beyond = feed_forward.max(attention.saturating_sub(freed));
+        let working = if blocks == 0 { 0 } else { beyond + if execution.recompute { block(r) } else { 0 } };
+        Self { activations, recomputed, working }
+    }
+}
+
+/// Scores of one piece of attention on a GPU, at most.
+const SCORES: u64 = (256 << 20) / F32;
 
 fn count(tensors: &[TensorInfo], part: &str, prefix: &str) -> u64 {
     tensors.iter().filter(|t| t.name.starts_with(prefix) && t.name.contains(part)).map(TensorInfo::count).sum()
@@ -254,9 +328,14 @@ impl fmt::Display for ModelInfo {
             "one training step          {:>12.2} GFLOP",
             (self.encoder_flops + 3.0 * self.forward_flops) / 1e9
         )?;
+        let Execution { gpu, compute, recompute } = self.execution;
+        writeln!(out, "\na training step on a {} in {compute:?}:", if gpu { "GPU" } else { "CPU" })?;
         writeln!(out, "weights, gradients, Adam   {:>12.2} GiB", gib(self.state_bytes))?;
         writeln!(out, "activations                {:>12.2} GiB", gib(self.activation_bytes))?;
-        write!(out, "activations, recomputed    {:>12.2} GiB", gib(self.recomputed_activation_bytes))
+        writeln!(out, "activations, recomputed    {:>12.2} GiB", gib(self.recomputed_activation_bytes))?;
+        writeln!(out, "one block going backward   {:>12.2} GiB", gib(self.working_bytes))?;
+        let with = if recompute { "recomputed" } else { "kept" };
+        write!(out, "together, activations {with:<11} {:>7.2} GiB", gib(self.step_bytes))
     }
 }
 
@@ -334,6 +413,22 @@ mod tests {
             assert_eq!(info.frozen, model(&config).encoder().dinov2().unwrap().num_params() as u64);
             assert_eq!(info.trainable + info.frozen, model(&config).num_params() as u64);
         }
+    }
+
+    #[test]
+    fn a_step_of_the_papers_size_fits_80_gb_with_recomputation() {
+        // 8,192 Gaussians, 8 views at 504 px (the largest multiple of DINOv2's patch within 512).
+        let config = ModelConfig { image_size: 504, ..ModelConfig::default() };
+        let load = Workload { batch: 1, views: 8, gaussians: 8192 };
+        let of =
+            |gpu, compute, recompute| ModelInfo::with_execution(&config, load, Execution { gpu, compute, recompute });
+        let (kept, recomputed) = (of(true, Compute::Bf16, false), of(true, Compute::Bf16, true));
+        assert!(recomputed.step_bytes < 80_000_000_000, "{recomputed}");
+        assert!(recomputed.step_bytes < kept.step_bytes);
+        assert!(kept.step_bytes < of(true, Compute::F32, false).step_bytes);
+        // On a CPU, precision changes no memory.
+        assert_eq!(of(false, Compute::Bf16, true).step_bytes, of(false, Compute::F32, true).step_bytes);
+        assert!(recomputed.to_string().contains("GPU in Bf16"));
     }
 
     #[test]

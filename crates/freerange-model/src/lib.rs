@@ -3,6 +3,7 @@
 //! [`FreeRange`] is the whole network as one module; [`Checkpoint`] is a trained one with everything that sampling
 //! needs. This crate knows nothing of losses or data.
 
+pub mod bench;
 mod checkpoint;
 mod config;
 mod dit;
@@ -22,7 +23,7 @@ pub use config::{CHANNELS, Dinov2Config, EncoderConfig, FinalLayer, ModelConfig,
 pub use dit::{Dit, time_embedding};
 pub use encoder::{Dinov2, ImageEncoder, WeightsOrigin, position_embedding};
 pub use error::ModelError;
-pub use info::{ModelInfo, PartInfo, TensorInfo, Workload, dinov2_parameters, tensors};
+pub use info::{Execution, ModelInfo, PartInfo, TensorInfo, Workload, dinov2_parameters, tensors};
 pub use layers::{Linear, NormWeight};
 pub use model::{FreeRange, Parameter};
 pub use ops::Compute;

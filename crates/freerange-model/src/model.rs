@@ -65,12 +65,21 @@ impl FreeRange {
     pub fn with_dinov2(mut self, config: &ModelConfig, dinov2: Dinov2) -> Result<Self, ModelError> {
         check_dinov2(config, &dinov2)?;
         self.encoder.replace_dinov2(dinov2);
+        self.encoder.set_compute(self.dit.compute());
         Ok(self)
     }
 
-    /// The same model, with the transformer's linear layers computed this way.
+    /// The same model, computing this way: the transformer's blocks, and on a GPU a frozen DINOv2 too. Whether a
+    /// device can, [`Compute::supported`] tells.
     pub fn with_compute(mut self, compute: Compute) -> Self {
         self.dit.set_compute(compute);
+        self.encoder.set_compute(compute);
+        self
+    }
+
+    /// The same model, whose blocks keep only their inputs for the gradient: see [`Dit::set_recompute`].
+    pub fn with_recompute(mut self, recompute: bool) -> Self {
+        self.dit.set_recompute(recompute);
         self
     }
 

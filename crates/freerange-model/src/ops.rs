@@ -1,68 +1,93 @@
-//! The five differentiable operations that a transformer block is made of.
+//! The differentiable operations that a transformer is made of.
 //!
-//! Each has two implementations: [`reference`], a few lines of tensor operations that run on any device and say what
-//! is computed, and [`crate::kernels`], fused Rust for the CPU with hand-written gradients. Tests hold the second to
-//! the first.
+//! Each has two implementations: [`reference`], a few lines of tensor operations that say what is computed, and
+//! [`crate::kernels`], fused, with hand-written gradients. Tests hold the second to the first.
 
 use burn::{
     backend::Dispatch,
-    tensor::{Device, Tensor},
+    tensor::{DType, Device, FloatDType, Tensor},
 };
 
-use crate::kernels::FusedOps;
+use crate::kernels::{
+    autodiff::FusedOps,
+    block::{BlockSettings, Weights},
+};
 
 /// Epsilon of both norms.
 pub(crate) const EPS: f32 = 1e-6;
 
-/// Whether a tensor lives where the fused operations run.
-fn is_cpu(device: &Device) -> bool {
-    device == &Device::flex()
-}
-
-/// How the products of linear layers are computed. Everything else is in f32 always.
+/// In which precision the blocks of the transformer compute. Weights, their gradients, the residual stream, sums and
+/// statistics are f32 always.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Compute {
     /// In f32.
     #[default]
     F32,
-    /// Operands rounded to bf16, sums in f32. On a CPU without AVX-512 BF16 instructions: in f32.
+    /// In bf16. On a GPU: operands of products and the activations between them. On a CPU: operands of linear layers'
+    /// products; without AVX-512 BF16 instructions, f32.
     Bf16,
+    /// In f16, on GPUs without bf16. For inference: small gradients vanish. On a CPU: f32.
+    F16,
+}
+
+impl Compute {
+    /// Whether a device can compute this way. A CPU takes [`Bf16`](Self::Bf16) as leave to use it where it can, and
+    /// has no use for [`F16`](Self::F16).
+    pub fn supported(self, device: &Device) -> bool {
+        match self {
+            Self::F32 => true,
+            Self::Bf16 if is_cpu(device) => true,
+            Self::F16 if is_cpu(device) => false,
+            Self::Bf16 | Self::F16 => device.supports_dtype(self.dtype()),
+        }
+    }
+
+    /// The type of activations on a GPU.
+    pub(crate) fn dtype(self) -> DType {
+        match self {
+            Self::F32 => DType::F32,
+            Self::Bf16 => DType::BF16,
+            Self::F16 => DType::F16,
+        }
+    }
+}
+
+/// As activations between operations are on a GPU.
+pub(crate) fn activation<const D: usize>(t: Tensor<D>, compute: Compute) -> Tensor<D> {
+    match compute {
+        Compute::F32 => t,
+        Compute::Bf16 => t.cast(FloatDType::BF16),
+        Compute::F16 => t.cast(FloatDType::F16),
+    }
+}
+
+/// Whether this is the device of the CPU's kernels.
+pub(crate) fn is_cpu(device: &Device) -> bool {
+    device.clone().inner() == Device::flex()
 }
 
 /// `x W^T + b`; `x` `[..., in]`, `w` `[out, in]`, `b` `[out]`.
 pub(crate) fn linear<const D: usize>(x: Tensor<D>, w: Tensor<2>, b: Tensor<1>, compute: Compute) -> Tensor<D> {
-    if is_cpu(&x.device()) {
-        let (x, w, b) = (x.into_dispatch(), w.into_dispatch(), b.into_dispatch());
-        return Tensor::from_dispatch(Dispatch::linear_bias(x, w, b, compute == Compute::Bf16));
-    }
-    reference::linear(x, w, b, compute)
+    let (x, w, b) = (x.into_dispatch(), w.into_dispatch(), b.into_dispatch());
+    Tensor::from_dispatch(Dispatch::linear_bias(x, w, b, compute))
 }
 
 /// Layer norm without weights, then `y (1 + scale) + shift`; `x` `[b, t, d]`, `shift` and `scale` `[b, d]`.
-pub(crate) fn modulated_norm(x: Tensor<3>, shift: Tensor<2>, scale: Tensor<2>) -> Tensor<3> {
-    if is_cpu(&x.device()) {
-        let (x, shift, scale) = (x.into_dispatch(), shift.into_dispatch(), scale.into_dispatch());
-        return Tensor::from_dispatch(Dispatch::modulated_norm(x, shift, scale));
-    }
-    reference::modulated_norm(x, shift, scale)
+pub(crate) fn modulated_norm(x: Tensor<3>, shift: Tensor<2>, scale: Tensor<2>, compute: Compute) -> Tensor<3> {
+    let (x, shift, scale) = (x.into_dispatch(), shift.into_dispatch(), scale.into_dispatch());
+    Tensor::from_dispatch(Dispatch::modulated_norm(x, shift, scale, compute))
 }
 
 /// `x + gate y`; `x` and `y` `[b, t, d]`, `gate` `[b, d]`.
 pub(crate) fn gated_add(x: Tensor<3>, gate: Tensor<2>, y: Tensor<3>) -> Tensor<3> {
-    if is_cpu(&x.device()) {
-        let (x, gate, y) = (x.into_dispatch(), gate.into_dispatch(), y.into_dispatch());
-        return Tensor::from_dispatch(Dispatch::gated_add(x, gate, y));
-    }
-    reference::gated_add(x, gate, y)
+    let (x, gate, y) = (x.into_dispatch(), gate.into_dispatch(), y.into_dispatch());
+    Tensor::from_dispatch(Dispatch::gated_add(x, gate, y))
 }
 
 /// The halves `(a, g)` of the last axis as `a gelu(g)`, exact GELU; `[b, t, 2 f]` to `[b, t, f]`.
 pub(crate) fn geglu(x: Tensor<3>) -> Tensor<3> {
-    if is_cpu(&x.device()) {
-        return Tensor::from_dispatch(Dispatch::geglu(x.into_dispatch()));
-    }
-    reference::geglu(x)
+    Tensor::from_dispatch(Dispatch::geglu(x.into_dispatch()))
 }
 
 /// Self-attention with RMS norm of queries and keys per head.
@@ -76,11 +101,28 @@ pub(crate) fn attention(
     heads: usize,
     queries: usize,
 ) -> Tensor<3> {
-    if is_cpu(&qkv.device()) {
-        let (qkv, q_weight, k_weight) = (qkv.into_dispatch(), q_weight.into_dispatch(), k_weight.into_dispatch());
-        return Tensor::from_dispatch(Dispatch::qk_norm_attention(qkv, q_weight, k_weight, heads, queries));
-    }
-    reference::attention(qkv, q_weight, k_weight, heads, queries)
+    let (qkv, q_weight, k_weight) = (qkv.into_dispatch(), q_weight.into_dispatch(), k_weight.into_dispatch());
+    Tensor::from_dispatch(Dispatch::qk_norm_attention(qkv, q_weight, k_weight, heads, queries))
+}
+
+/// Self-attention of all tokens, without norms; `qkv` as in [`attention`].
+pub(crate) fn plain_attention(qkv: Tensor<3>, heads: usize) -> Tensor<3> {
+    Tensor::from_dispatch(Dispatch::plain_attention(qkv.into_dispatch(), heads))
+}
+
+/// A whole transformer block, see [`crate::kernels::block`]. Of the attention's and the feed-forward network's layers:
+/// `matrices` are qkv, out, in, down, and `vectors` qkv's bias, both norms' weights, the biases of out, in, down.
+pub(crate) fn dit_block(
+    x: Tensor<3>,
+    modulation: Tensor<2>,
+    matrices: [Tensor<2>; 4],
+    vectors: [Tensor<1>; 6],
+    settings: BlockSettings,
+) -> Tensor<3> {
+    let [qkv, out, inner, down] = matrices.map(Tensor::into_dispatch);
+    let [qkv_bias, q_norm, k_norm, out_bias, inner_bias, down_bias] = vectors.map(Tensor::into_dispatch);
+    let weights = Weights { qkv, qkv_bias, q_norm, k_norm, out, out_bias, inner, inner_bias, down, down_bias };
+    Tensor::from_dispatch(Dispatch::dit_block(x.into_dispatch(), modulation.into_dispatch(), weights, settings))
 }
 
 /// The same operations from Burn's own: any device, differentiated by Burn.
@@ -97,11 +139,13 @@ pub(crate) mod reference {
     pub fn linear<const D: usize>(x: Tensor<D>, w: Tensor<2>, b: Tensor<1>, compute: Compute) -> Tensor<D> {
         match compute {
             Compute::F32 => burn_linear(x, w.transpose(), Some(b)),
-            Compute::Bf16 => {
-                let (x, w) = (x.cast(FloatDType::BF16), w.cast(FloatDType::BF16));
-                burn_linear(x, w.transpose(), None).cast(FloatDType::F32) + b.unsqueeze::<D>()
-            }
+            Compute::Bf16 => half_linear(x, w, b, FloatDType::BF16),
+            Compute::F16 => half_linear(x, w, b, FloatDType::F16),
         }
+    }
+
+    fn half_linear<const D: usize>(x: Tensor<D>, w: Tensor<2>, b: Tensor<1>, half: FloatDType) -> Tensor<D> {
+        burn_linear(x.cast(half), w.cast(half).transpose(), None).cast(FloatDType::F32) + b.unsqueeze::<D>()
     }
 
     pub fn modulated_norm(x: Tensor<3>, shift: Tensor<2>, scale: Tensor<2>) -> Tensor<3> {
@@ -141,5 +185,17 @@ pub(crate) mod reference {
         let k = rms_norm(part(1), k_weight);
         let mixed = scaled_dot_product(q, k, part(2), None, None, AttentionModuleOptions::default());
         mixed.swap_dims(1, 2).reshape([b, queries, heads * width])
+    }
+
+    /// Of all tokens, without norms.
+    #[cfg(test)]
+    pub fn plain_attention(qkv: Tensor<3>, heads: usize) -> Tensor<3> {
+        let [b, t, d3] = qkv.dims();
+        let width = d3 / 3 / heads;
+        let [q, k, v] = std::array::from_fn(|i| {
+            qkv.clone().narrow(2, i * heads * width, heads * width).reshape([b, t, heads, width]).swap_dims(1, 2)
+        });
+        let mixed = scaled_dot_product(q, k, v, None, None, AttentionModuleOptions::default());
+        mixed.swap_dims(1, 2).reshape([b, t, heads * width])
     }
 }

@@ -114,7 +114,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         let mut plain = None;
         let cloud = match (&checkpoint, args.method) {
             (Some(checkpoint), _) => {
-                let options = args.sampling.options(checkpoint, 1)?;
+                let options = args.sampling.options(checkpoint, 1, &device)?;
                 let result = pipeline::run(&inputs, checkpoint, &options, &device)?;
                 let first = result.samples.first().ok_or_else(|| CliError::input("no sample was drawn"))?;
                 if options.refine > 0 {

@@ -1,5 +1,6 @@
 //! One file per command: its arguments, and what it prints and writes.
 
+pub mod bench;
 pub mod data;
 pub mod devices;
 pub mod eval;

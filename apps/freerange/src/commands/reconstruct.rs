@@ -2,13 +2,15 @@
 
 use std::{path::PathBuf, time::Instant};
 
+use burn::tensor::Device;
 use freerange_camera::{Scene, Up, View};
-use freerange_flow::sample::SampleConfig;
+use freerange_flow::sample::{SampleConfig, Solver};
+use freerange_model::Compute;
 use freerange_splat::write_ply;
 use serde::Serialize;
 
 use crate::{
-    device::DeviceName,
+    device::{DeviceName, parse_compute, require},
     error::CliError,
     output::OutputFolder,
     pictures::{grid, on_white, render_view, to_picture, write_turntable},
@@ -64,6 +66,12 @@ pub struct Sampling {
     /// Photometric guidance scale lambda; 0 is none [default: the checkpoint's].
     #[arg(long)]
     pub photometric: Option<f32>,
+    /// How the steps are taken: euler, heun (two evaluations per step) or multistep [default: the checkpoint's].
+    #[arg(long, value_parser = parse_solver)]
+    pub solver: Option<Solver>,
+    /// Arithmetic of the transformer: f32, or bf16 or f16 where the device has it [default: the checkpoint's].
+    #[arg(long, value_parser = parse_compute)]
+    pub compute: Option<Compute>,
     /// Which way is up in the scene's frame.
     #[arg(long, value_enum, default_value = "z")]
     pub up: UpName,
@@ -83,6 +91,11 @@ pub enum UpName {
     Cameras,
 }
 
+/// `euler`, `heun` or `multistep`.
+fn parse_solver(text: &str) -> Result<Solver, String> {
+    serde_json::from_value(text.into()).map_err(|_| "expected euler, heun or multistep".into())
+}
+
 impl Sampling {
     /// Which way is up, as the camera crate calls it.
     pub fn up(&self) -> Up {
@@ -94,7 +107,12 @@ impl Sampling {
     }
 
     /// The checkpoint's own way to sample, with what the user overrides.
-    pub fn options(&self, checkpoint: &freerange_model::Checkpoint, samples: u32) -> Result<Options, CliError> {
+    pub fn options(
+        &self,
+        checkpoint: &freerange_model::Checkpoint,
+        samples: u32,
+        device: &Device,
+    ) -> Result<Options, CliError> {
         let mut sample: SampleConfig = match checkpoint.provenance.get("sample") {
             Some(value) => serde_json::from_value(value.clone())
                 .map_err(|e| CliError::input(format!("checkpoint: field `sample` of the metadata: {e}")))?,
@@ -104,7 +122,10 @@ impl Sampling {
         sample.depth = self.depth.or(sample.depth);
         sample.guidance = self.guidance.unwrap_or(sample.guidance);
         sample.photometric = self.photometric.unwrap_or(sample.photometric);
+        sample.solver = self.solver.unwrap_or(sample.solver);
+        sample.compute = self.compute.unwrap_or(sample.compute);
         sample.validate()?;
+        require(sample.compute, device)?;
         Ok(Options {
             sample,
             seeds: (0..u64::from(samples)).map(|i| self.seed.wrapping_add(i)).collect(),
@@ -156,7 +177,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         further.extend(other.further);
     }
     let checkpoint = checkpoint(args.sampling.checkpoint.as_deref(), &device)?;
-    let options = args.sampling.options(&checkpoint, args.samples)?;
+    let options = args.sampling.options(&checkpoint, args.samples, &device)?;
     let output = OutputFolder::create(&args.output)?;
     let mut seconds = vec![("load", begin.elapsed().as_secs_f64())];
 

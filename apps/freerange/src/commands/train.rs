@@ -4,7 +4,12 @@ use std::{io::Write, path::PathBuf, time::Instant};
 
 use freerange_flow::{config::TrainConfig, trainer::Trainer};
 
-use crate::{device::DeviceName, error::CliError, progress::Progress, runtime::checkpoint};
+use crate::{
+    device::{DeviceName, require},
+    error::CliError,
+    progress::Progress,
+    runtime::checkpoint,
+};
 
 /// Train a model. Run the same command again to go on where it was stopped.
 ///
@@ -35,6 +40,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     let begin = Instant::now();
     let device = args.device.open()?;
     let config = TrainConfig::load(&args.config)?;
+    require(config.optimizer.compute, &device)?;
     let total = config.total_steps();
     let initial = args.initial.as_deref().map(|path| checkpoint(Some(path), &device)).transpose()?;
     let mut trainer = Trainer::open(config, &args.output, initial.as_ref(), &device, |m| eprintln!("{m}"))?;

@@ -1,14 +1,13 @@
 //! DINOv2 (Oquab et al. 2023; registers: Darcet et al. 2023), read from Hugging Face folders.
 
-use std::path::Path;
+use std::{path::Path, sync::Arc};
 
 use burn::{
     module::{Module, Param},
     tensor::{
-        Device, Tensor, TensorData,
+        Device, FloatDType, Tensor, TensorData,
         activation::{gelu, silu},
-        module::{attention, layer_norm},
-        ops::AttentionModuleOptions,
+        module::layer_norm,
     },
 };
 use sha2::{Digest, Sha256};
@@ -17,6 +16,7 @@ use super::bicubic;
 use crate::{
     Dinov2Config, ModelError,
     layers::{Builder, Init, Linear, Source},
+    ops::{self, Compute},
     weights::{TensorFile, read_bounded},
 };
 
@@ -39,6 +39,9 @@ pub struct Dinov2 {
     projection: Linear,                        // [d, 3 * patch * patch]
     layers: Vec<Layer>,
     norm: LayerNorm,
+    /// `position` once more, where it is resampled for other image sizes.
+    #[module(skip)]
+    stored_position: Arc<[f32]>,
     #[module(skip)]
     config: Dinov2Config,
     #[module(skip)]
@@ -54,7 +57,7 @@ struct LayerNorm {
 #[derive(Module, Debug)]
 struct Layer {
     norm1: LayerNorm,
-    qkv: [Linear; 3],
+    qkv: Linear, // [3 d, d]
     out: Linear,
     scale1: Param<Tensor<1>>,
     norm2: LayerNorm,
@@ -74,16 +77,20 @@ impl Dinov2 {
         let pixels = 3 * patch * patch;
         let weight = builder.reshaped(&format!("{conv}.weight"), &[d, 3, patch, patch], [d, pixels], small)?;
         let projection = Linear::new(weight, builder.param(&format!("{conv}.bias"), [d], Init::Zeros)?);
+        let position_shape = [1, 1 + side * side, d];
+        let position = builder.source.values("embeddings.position_embeddings", &position_shape, small)?;
+        let position_data = TensorData::new(position.clone(), position_shape);
         Ok(Self {
             cls_token: builder.param("embeddings.cls_token", [1, 1, d], small)?,
             register_tokens: match config.registers {
                 0 => None,
                 n => Some(builder.param("embeddings.register_tokens", [1, n, d], small)?),
             },
-            position: builder.param("embeddings.position_embeddings", [1, 1 + side * side, d], small)?,
+            position: Param::from_tensor(Tensor::from_data(position_data, builder.device)),
             projection,
             layers: (0..config.layers).map(|i| Layer::build(config, i, builder)).collect::<Result<_, _>>()?,
             norm: LayerNorm::build("layernorm", d, builder)?,
+            stored_position: position.into(),
             config: config.clone(),
             origin: None,
         })
@@ -106,6 +113,16 @@ impl Dinov2 {
             sha256: hash.iter().map(|byte| format!("{byte:02x}")).collect(),
         });
         Ok(model)
+    }
+
+    /// In which precision the layers compute on a GPU; on a CPU always in f32.
+    pub(crate) fn set_compute(&mut self, compute: Compute) {
+        let compute = if ops::is_cpu(&self.cls_token.val().device()) { Compute::F32 } else { compute };
+        for layer in &mut self.layers {
+            for linear in [&mut layer.qkv, &mut layer.out, &mut layer.mlp_in, &mut layer.mlp_out] {
+                linear.set_compute(compute);
+            }
+        }
     }
 
     /// The architecture.
@@ -147,8 +164,7 @@ impl Dinov2 {
         if square && rows * columns == side * side {
             return stored;
         }
-        let values: Vec<f32> = stored.to_data().convert::<f32>().try_into_vec::<f32>().expect("converted to f32");
-        let (class, grid) = values.split_at(d);
+        let (class, grid) = self.stored_position.split_at(d);
         let mut all = class.to_vec();
         all.extend(bicubic::resample(grid, side, [rows, columns], d, self.config.antialias));
         Tensor::from_data(TensorData::new(all, [1, 1 + rows * columns, d]), &stored.device())
@@ -205,15 +221,20 @@ impl Layer {
         let (d, inner) = (config.hidden, config.ffn_width());
         let name = |part: &str| format!("encoder.layer.{i}.{part}");
         let small = Init::Normal(0.02);
-        let mut projection = |part: &str| -> Result<Linear, ModelError> {
+        // Three layers in the file, one product here.
+        let (mut weight, mut bias) = (Vec::with_capacity(3 * d * d), Vec::with_capacity(3 * d));
+        for part in ["query", "key", "value"] {
             let name = name(&format!("attention.attention.{part}"));
+            weight.extend(builder.source.values(&format!("{name}.weight"), &[d, d], small)?);
             if config.qkv_bias {
-                return builder.linear(&name, d, d, small);
+                bias.extend(builder.source.values(&format!("{name}.bias"), &[d], Init::Zeros)?);
             }
-            let weight: Param<Tensor<2>> = builder.param(&format!("{name}.weight"), [d, d], small)?;
-            Ok(Linear::new(weight, Param::from_tensor(Tensor::zeros([d], builder.device))))
-        };
-        let qkv = [projection("query")?, projection("key")?, projection("value")?];
+        }
+        bias.resize(3 * d, 0.0);
+        let qkv = Linear::new(
+            Param::from_tensor(Tensor::from_data(TensorData::new(weight, [3 * d, d]), builder.device)),
+            Param::from_tensor(Tensor::from_data(TensorData::new(bias, [3 * d]), builder.device)),
+        );
         let (mlp_in, mlp_out) = match config.swiglu {
             true => (
                 builder.linear(&name("mlp.weights_in"), d, 2 * inner, small)?,
@@ -236,14 +257,11 @@ impl Layer {
     }
 
     fn forward(&self, x: Tensor<3>, config: &Dinov2Config) -> Tensor<3> {
-        let [b, tokens, d] = x.dims();
-        let heads = config.heads;
-        let y = self.norm1.forward(x.clone(), config.layer_norm_eps);
-        let split = |i: usize| self.qkv[i].forward(y.clone()).reshape([b, tokens, heads, d / heads]).swap_dims(1, 2);
-        let y = attention(split(0), split(1), split(2), None, None, AttentionModuleOptions::default());
-        let y = self.out.forward(y.swap_dims(1, 2).reshape([b, tokens, d]));
+        let d = x.dims()[2];
+        let y = self.qkv.forward(self.norm1.forward(x.clone(), config.layer_norm_eps));
+        let y = full(self.out.forward(ops::plain_attention(y, config.heads)));
         let x = x + y * self.scale1.val().reshape([1, 1, d]);
-        let y = self.mlp_in.forward(self.norm2.forward(x.clone(), config.layer_norm_eps));
+        let y = full(self.mlp_in.forward(self.norm2.forward(x.clone(), config.layer_norm_eps)));
         let y = match config.swiglu {
             true => {
                 let inner = config.ffn_width();
@@ -251,8 +269,13 @@ impl Layer {
             }
             false => gelu(y),
         };
-        x + self.mlp_out.forward(y) * self.scale2.val().reshape([1, 1, d])
+        x + full(self.mlp_out.forward(y)) * self.scale2.val().reshape([1, 1, d])
     }
+}
+
+/// In f32, whatever a linear layer computed in.
+fn full(x: Tensor<3>) -> Tensor<3> {
+    x.cast(FloatDType::F32)
 }
 
 /// The fields of a Hugging Face `config.json` that matter here.

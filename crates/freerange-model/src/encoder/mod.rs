@@ -17,6 +17,7 @@ use patch::PatchMlp;
 use crate::{
     EncoderConfig, ModelConfig, ModelError, PLUCKER,
     layers::{Builder, Source},
+    ops::Compute,
 };
 
 /// Turns posed images into image tokens.
@@ -52,6 +53,12 @@ impl ImageEncoder {
     /// The frozen DINOv2, if this encoder has one.
     pub fn dinov2(&self) -> Option<&Dinov2> {
         self.dinov2.as_ref()
+    }
+
+    pub(crate) fn set_compute(&mut self, compute: Compute) {
+        if let Some(dinov2) = &mut self.dinov2 {
+            dinov2.set_compute(compute);
+        }
     }
 
     pub(crate) fn replace_dinov2(&mut self, dinov2: Dinov2) {

@@ -3,22 +3,30 @@ use burn::{
     tensor::{Device, Tensor},
 };
 
-use super::{Golden, path};
+use super::{Golden, devices, half_devices, path};
 use crate::{Dinov2, ModelError};
 
-/// Every stored image size of a folder: the tokens after the last norm.
+/// Every stored image size of a folder, on every device: the tokens after the last norm.
 fn folder(name: &str) -> Dinov2 {
-    let device = Device::flex();
-    let dinov2 = Dinov2::load(&path(&format!("dino/{name}")), &device).unwrap();
     let golden = Golden::read(&format!("dino/{name}/io.safetensors"));
     let sizes: Vec<&str> = golden.names().filter_map(|n| n.strip_prefix("in/pixel_values_")).collect();
     assert!(!sizes.is_empty());
-    for size in sizes {
-        let pixels: Tensor<4> = golden.tensor(&format!("in/pixel_values_{size}"), &device);
-        golden.check_absolute(&format!("out/embeddings_{size}"), dinov2.embed(pixels.clone()), 3e-4);
-        golden.check_absolute(&format!("out/last_hidden_state_{size}"), dinov2.forward(pixels), 3e-4);
+    let load = |device: &Device| Dinov2::load(&path(&format!("dino/{name}")), device).unwrap();
+    for device in devices() {
+        let dinov2 = load(&device);
+        for size in &sizes {
+            let pixels: Tensor<4> = golden.tensor(&format!("in/pixel_values_{size}"), &device);
+            golden.check_absolute(&format!("out/embeddings_{size}"), dinov2.embed(pixels.clone()), 3e-4);
+            golden.check_absolute(&format!("out/last_hidden_state_{size}"), dinov2.forward(pixels), 3e-4);
+        }
     }
-    dinov2
+    for (device, compute) in half_devices() {
+        let mut dinov2 = load(&device);
+        dinov2.set_compute(compute);
+        let pixels: Tensor<4> = golden.tensor(&format!("in/pixel_values_{}", sizes[0]), &device);
+        golden.check(&format!("out/last_hidden_state_{}", sizes[0]), dinov2.forward(pixels), 2e-2);
+    }
+    load(&Device::flex())
 }
 
 #[test]

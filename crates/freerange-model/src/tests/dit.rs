@@ -3,10 +3,12 @@ use burn::{
     tensor::{Device, Gradients, Tensor},
 };
 
-use super::{Golden, numbers, path};
+use super::{Golden, devices, half_devices, numbers, path};
 use crate::{
-    Compute, Dit, EncoderConfig, FinalLayer, FreeRange, ModelConfig, PatchConfig, dit::time_embedding, layers::Builder,
-    ops, weights::TensorFile,
+    Compute, Dit, EncoderConfig, FinalLayer, FreeRange, ModelConfig, PatchConfig,
+    dit::{Parts, time_embedding},
+    layers::Builder,
+    weights::TensorFile,
 };
 
 fn golden_dit(name: &str, final_layer: FinalLayer, image_channels: usize, device: &Device) -> Dit {
@@ -56,13 +58,14 @@ impl ModuleVisitor for GradientCheck<'_> {
     }
 }
 
-fn whole(name: &str, final_layer: FinalLayer) {
-    let device = Device::flex().autodiff();
+fn whole(name: &str, final_layer: FinalLayer, device: &Device, recompute: bool) {
+    let device = device.clone().autodiff();
     let golden = Golden::read(&format!("dit/{name}.safetensors"));
     let input = |part: &str| golden.tensor::<3>(&format!("in/{part}"), &device).require_grad();
     let (z, gradient, images) = (input("z"), input("grad_channels"), input("img"));
     let t = golden.tensor::<1>("in/t", &device).require_grad();
-    let dit = golden_dit(name, final_layer, images.dims()[2], &device);
+    let mut dit = golden_dit(name, final_layer, images.dims()[2], &device);
+    dit.set_recompute(recompute);
 
     golden.check("out/cond", dit.condition(t.clone()), 1e-4);
     let tokens = dit.tokens(z.clone(), Some(gradient.clone()), images.clone());
@@ -85,24 +88,29 @@ fn whole(name: &str, final_layer: FinalLayer) {
 
 #[test]
 fn matches_the_reference_with_a_modulated_output() {
-    whole("dit_adaln_final", FinalLayer::Adaln);
+    for device in devices() {
+        whole("dit_adaln_final", FinalLayer::Adaln, &device, false);
+    }
 }
 
 #[test]
 fn matches_the_reference_with_a_plain_output() {
-    whole("dit_linear_final", FinalLayer::Linear);
+    for device in devices() {
+        whole("dit_linear_final", FinalLayer::Linear, &device, true);
+    }
 }
 
 #[test]
-fn bf16_stays_near() {
-    let device = Device::flex();
-    let golden = Golden::read("dit/dit_adaln_final.safetensors");
-    let input = |part: &str| golden.tensor::<3>(&format!("in/{part}"), &device);
-    let images = input("img");
-    let mut dit = golden_dit("dit_adaln_final", FinalLayer::Adaln, images.dims()[2], &device);
-    dit.set_compute(Compute::Bf16);
-    let out = dit.forward(input("z"), Some(input("grad_channels")), images, golden.tensor("in/t", &device));
-    golden.check("out/zhat1", out, 2e-2);
+fn half_precision_stays_near() {
+    for (device, compute) in half_devices().into_iter().chain([(Device::flex(), Compute::Bf16)]) {
+        let golden = Golden::read("dit/dit_adaln_final.safetensors");
+        let input = |part: &str| golden.tensor::<3>(&format!("in/{part}"), &device);
+        let images = input("img");
+        let mut dit = golden_dit("dit_adaln_final", FinalLayer::Adaln, images.dims()[2], &device);
+        dit.set_compute(compute);
+        let out = dit.forward(input("z"), Some(input("grad_channels")), images, golden.tensor("in/t", &device));
+        golden.check("out/zhat1", out, 2e-2);
+    }
 }
 
 #[test]
@@ -115,37 +123,16 @@ fn the_time_embedding_matches() {
     }
 }
 
-/// The pieces, from the fused operations or from their readable twins.
-struct Ops {
-    linear: fn(Tensor<3>, Tensor<2>, Tensor<1>) -> Tensor<3>,
-    norm: fn(Tensor<3>, Tensor<2>, Tensor<2>) -> Tensor<3>,
-    gated: fn(Tensor<3>, Tensor<2>, Tensor<3>) -> Tensor<3>,
-    geglu: fn(Tensor<3>) -> Tensor<3>,
-    attention: fn(Tensor<3>, Tensor<1>, Tensor<1>, usize, usize) -> Tensor<3>,
-}
-
 #[test]
 fn pieces_match_the_reference() {
-    let fused = Ops {
-        linear: |x, w, b| ops::linear(x, w, b, Compute::F32),
-        norm: ops::modulated_norm,
-        gated: ops::gated_add,
-        geglu: ops::geglu,
-        attention: ops::attention,
-    };
-    let readable = Ops {
-        linear: |x, w, b| ops::reference::linear(x, w, b, Compute::F32),
-        norm: ops::reference::modulated_norm,
-        gated: ops::reference::gated_add,
-        geglu: ops::reference::geglu,
-        attention: ops::reference::attention,
-    };
-    pieces(&fused);
-    pieces(&readable);
+    pieces(&Parts::readable(), &Device::flex());
+    for device in devices() {
+        pieces(&Parts::fused(), &device);
+    }
 }
 
-fn pieces(ops: &Ops) {
-    let device = Device::flex().autodiff();
+fn pieces(ops: &Parts, device: &Device) {
+    let device = device.clone().autodiff();
     let golden = Golden::read("dit/pieces.safetensors");
     let x = golden.tensor::<3>("in/x", &device).require_grad();
     let c = golden.tensor::<2>("in/c", &device).require_grad();
@@ -155,7 +142,7 @@ fn pieces(ops: &Ops) {
     let zeros = Tensor::<2>::zeros([2, 24], &device);
 
     let w = vector("rms_norm.weight");
-    let out = ops::reference::rms_norm(x.clone(), w.clone());
+    let out = crate::ops::reference::rms_norm(x.clone(), w.clone());
     golden.check("out/rmsnorm", out.clone(), 1e-4);
     let gradients = backward(out);
     golden.check("grad/rmsnorm/x", x.grad(&gradients).unwrap(), 1e-3);

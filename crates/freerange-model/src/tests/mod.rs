@@ -1,5 +1,6 @@
 //! Tests against the golden vectors, and of the fused operations against their readable twins.
 
+mod block;
 mod checkpoint;
 mod dinov2;
 mod dit;
@@ -9,6 +10,48 @@ mod ops;
 use std::collections::BTreeMap;
 
 use burn::tensor::{Device, Tensor, TensorData};
+
+use crate::Compute;
+
+/// The CPU and, with a feature for GPUs, the default one. That there is none makes tests fail.
+pub fn devices() -> Vec<Device> {
+    #[cfg(feature = "gpu")]
+    return vec![Device::flex(), gpu()];
+    #[cfg(not(feature = "gpu"))]
+    vec![Device::flex()]
+}
+
+/// The GPU with each half precision that it has.
+pub fn half_devices() -> Vec<(Device, Compute)> {
+    #[cfg(not(feature = "gpu"))]
+    return Vec::new();
+    #[cfg(feature = "gpu")]
+    [Compute::Bf16, Compute::F16]
+        .into_iter()
+        .filter(|compute| {
+            let supported = compute.supported(&gpu());
+            if !supported {
+                eprintln!("not tested: {:?} does not compute in {compute:?}", gpu());
+            }
+            supported
+        })
+        .map(|compute| (gpu(), compute))
+        .collect()
+}
+
+#[cfg(feature = "gpu")]
+pub fn gpu() -> Device {
+    #[cfg(feature = "cuda")]
+    return Device::cuda(0);
+    #[cfg(all(feature = "vulkan", not(feature = "cuda")))]
+    return Device::vulkan(burn::tensor::DeviceKind::DefaultDevice);
+    #[cfg(all(feature = "metal", not(any(feature = "cuda", feature = "vulkan"))))]
+    return Device::metal(burn::tensor::DeviceKind::DefaultDevice);
+    #[cfg(all(feature = "webgpu", not(any(feature = "cuda", feature = "vulkan", feature = "metal"))))]
+    return Device::wgpu(burn::tensor::DeviceKind::DefaultDevice);
+    #[cfg(not(any(feature = "cuda", feature = "vulkan", feature = "metal", feature = "webgpu")))]
+    panic!("the feature `gpu` alone reaches no device: choose cuda, vulkan, metal or webgpu");
+}
 
 /// The tensors of a golden file, as f32.
 pub struct Golden(BTreeMap<String, (Vec<usize>, Vec<f32>)>);
@@ -53,7 +96,7 @@ pub fn path(file: &str) -> std::path::PathBuf {
 }
 
 pub fn numbers<const D: usize>(t: Tensor<D>) -> Vec<f32> {
-    t.into_data().try_into_vec::<f32>().unwrap()
+    t.into_data().convert::<f32>().try_into_vec::<f32>().unwrap()
 }
 
 /// Holds every value to the expected one, within `tolerance` of the largest expected one.

@@ -1,4 +1,4 @@
-//! Self-attention with RMS norm of queries and keys, one head of one image at a time.
+//! Self-attention with or without RMS norm of queries and keys, one head of one image at a time.
 //!
 //! Scores exist only for a few query rows at once, and the gradient computes them again from the stored log of each
 //! softmax's denominator (the FlashAttention-2 scheme), so memory is linear in the number of tokens.
@@ -38,7 +38,38 @@ impl Sizes {
     }
 }
 
-/// Gathers the rows of one head (`stride` apart, from `x[0]`) as `factor weight x / rms(x)`, `[n, width]`.
+/// Gathers the rows of one head (`stride` apart, from `x[0]`) as `factor x`, `[n, width]`.
+fn scaled(x: &[f32], stride: usize, factor: f32, width: usize, out: &mut [f32]) {
+    for (i, out) in out.chunks_exact_mut(width).enumerate() {
+        for (out, x) in out.iter_mut().zip(&x[i * stride..][..width]) {
+            *out = factor * x;
+        }
+    }
+}
+
+/// Gathers the rows of one head as `factor weight x / rms(x)`, `[n, width]`; without weights, as `factor x`.
+fn gather(x: &[f32], stride: usize, weight: Option<&[f32]>, factor: f32, width: usize, out: &mut [f32]) {
+    match weight {
+        Some(weight) => normalised(x, stride, weight, factor, out),
+        None => scaled(x, stride, factor, width, out),
+    }
+}
+
+/// Backward of [`gather`]: turns the gradient rows in `grad` into those of `x`, and adds to that of the weights.
+fn gather_backward(
+    x: &[f32],
+    stride: usize,
+    weight: Option<&[f32]>,
+    factor: f32,
+    grad: &mut [f32],
+    d_weight: &mut [f32],
+) {
+    match weight {
+        Some(weight) => normalised_backward(x, stride, weight, factor, grad, d_weight),
+        None => scale_row(grad, factor),
+    }
+}
+
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma"))]
 fn normalised(x: &[f32], stride: usize, weight: &[f32], factor: f32, out: &mut [f32]) {
     let width = weight.len();
@@ -51,8 +82,7 @@ fn normalised(x: &[f32], stride: usize, weight: &[f32], factor: f32, out: &mut [
     }
 }
 
-/// Backward of [`normalised`]: turns the gradient rows in `grad` into those of `x`, and adds to that of `weight`. With
-/// r = 1 / rms(x) and h = weight grad: dx = r (h - x r^2 mean(h x)).
+/// With r = 1 / rms(x) and h = weight grad: dx = r (h - x r^2 mean(h x)).
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma"))]
 fn normalised_backward(x: &[f32], stride: usize, weight: &[f32], factor: f32, grad: &mut [f32], d_weight: &mut [f32]) {
     let width = weight.len();
@@ -109,20 +139,26 @@ fn scale_row(row: &mut [f32], factor: f32) {
     row.iter_mut().for_each(|x| *x *= factor);
 }
 
-/// See [`super::Kernels::attention_forward`].
+/// The norms' weights of queries and keys.
+type Weights<'a> = [&'a [f32]; 2];
+
+fn weights(norms: &[FlexTensor; 2]) -> Weights<'_> {
+    [values(&norms[0]), values(&norms[1])]
+}
+
+/// See [`crate::kernels::Kernels::attention_forward`].
 pub fn forward(
     qkv: FlexTensor,
-    q_weight: FlexTensor,
-    k_weight: FlexTensor,
+    norms: Option<[FlexTensor; 2]>,
     heads: usize,
     queries: usize,
 ) -> (FlexTensor, FlexTensor) {
-    let (qkv, q_weight, k_weight) = (contiguous(qkv), contiguous(q_weight), contiguous(k_weight));
+    let (qkv, norms) = (contiguous(qkv), norms.map(|norms| norms.map(contiguous)));
     let [b, tokens, d3] = dims(&qkv);
     let sizes = Sizes { tokens, queries, heads, width: d3 / 3 / heads };
     let d = sizes.d();
     assert!(d * 3 == d3 && queries <= tokens, "attention: heads and queries fit the tokens");
-    let (xs, wq, wk) = (values(&qkv), values(&q_weight), values(&k_weight));
+    let (xs, weights) = (values(&qkv), norms.as_ref().map(weights));
     let mut out = vec![0f32; b * queries * d];
     let mut log_sum = vec![0f32; b * heads * queries];
     let target = Shared(out.as_mut_ptr());
@@ -132,7 +168,7 @@ pub fn forward(
         // SAFETY: this task alone writes this image's rows at this head's columns, all within `out`.
         unsafe {
             let out = target.at(batch * queries * d + head * sizes.width);
-            head_forward(rows, wq, wk, sizes, head, out, log_sum);
+            head_forward(rows, weights, sizes, head, out, log_sum);
         }
     });
     (tensor(out, &[b, queries, d]), tensor(log_sum, &[b, heads, queries]))
@@ -142,8 +178,7 @@ pub fn forward(
 /// `out` must be valid for `queries` rows of `width` values, `d` apart, that nothing else touches.
 unsafe fn head_forward(
     rows: &[f32],
-    wq: &[f32],
-    wk: &[f32],
+    weights: Option<Weights<'_>>,
     sizes: Sizes,
     head: usize,
     out: *mut f32,
@@ -152,7 +187,7 @@ unsafe fn head_forward(
     let Sizes { tokens, queries, width, .. } = sizes;
     let stride = 3 * sizes.d();
     let mut k = vec![0f32; tokens * width];
-    normalised(&rows[sizes.column(1, head)..], stride, wk, 1.0, &mut k);
+    gather(&rows[sizes.column(1, head)..], stride, weights.map(|w| w[1]), 1.0, width, &mut k);
     let v = Matrix::rows(&rows[sizes.column(2, head)..], stride);
     let mut q = vec![0f32; ROWS * width];
     let mut scores = vec![0f32; ROWS * tokens];
@@ -160,7 +195,8 @@ unsafe fn head_forward(
     for first in (0..queries).step_by(ROWS) {
         let n = ROWS.min(queries - first);
         let start = (tokens - queries + first) * stride + sizes.column(0, head);
-        normalised(&rows[start..], stride, wq, (width as f32).sqrt().recip(), &mut q[..n * width]);
+        let factor = (width as f32).sqrt().recip();
+        gather(&rows[start..], stride, weights.map(|w| w[0]), factor, width, &mut q[..n * width]);
         let (q, k) = (Matrix::rows(&q, width), Matrix::rows(&k, width).transposed());
         // SAFETY: `scores` is ours; the rows of `out` are by the caller's promise.
         unsafe {
@@ -176,22 +212,21 @@ unsafe fn head_forward(
     }
 }
 
-/// See [`super::Kernels::attention_backward`].
+/// See [`crate::kernels::Kernels::attention_backward`].
 pub fn backward(
     qkv: FlexTensor,
-    q_weight: FlexTensor,
-    k_weight: FlexTensor,
+    norms: Option<[FlexTensor; 2]>,
     out: FlexTensor,
     log_sum: FlexTensor,
     grad: FlexTensor,
     heads: usize,
-) -> [FlexTensor; 3] {
-    let (qkv, q_weight, k_weight) = (contiguous(qkv), contiguous(q_weight), contiguous(k_weight));
+) -> (FlexTensor, Option<[FlexTensor; 2]>) {
+    let (qkv, norms) = (contiguous(qkv), norms.map(|norms| norms.map(contiguous)));
     let (out, log_sum, grad) = (contiguous(out), contiguous(log_sum), contiguous(grad));
     let [b, tokens, d3] = dims(&qkv);
     let [_, queries, d] = dims(&out);
     let sizes = Sizes { tokens, queries, heads, width: d / heads };
-    let (xs, wq, wk) = (values(&qkv), values(&q_weight), values(&k_weight));
+    let (xs, weights) = (values(&qkv), norms.as_ref().map(weights));
     let (outs, log_sums, grads) = (values(&out), values(&log_sum), values(&grad));
     let mut d_qkv = vec![0f32; xs.len()];
     let target = Shared(d_qkv.as_mut_ptr());
@@ -206,7 +241,7 @@ pub fn backward(
                 log_sum: &log_sums[task * queries..][..queries],
             };
             // SAFETY: this task alone writes this image's rows at this head's columns, all within `d_qkv`.
-            unsafe { head_backward(saved, wq, wk, sizes, head, target.at(batch * tokens * d3)) }
+            unsafe { head_backward(saved, weights, sizes, head, target.at(batch * tokens * d3)) }
         })
         .collect();
     let (mut d_wq, mut d_wk) = (vec![0f32; sizes.width], vec![0f32; sizes.width]);
@@ -214,7 +249,8 @@ pub fn backward(
         math::add(&mut d_wq, wq);
         math::add(&mut d_wk, wk);
     }
-    [tensor(d_qkv, &[b, tokens, d3]), tensor(d_wq, &[sizes.width]), tensor(d_wk, &[sizes.width])]
+    let d_norms = norms.map(|_| [tensor(d_wq, &[sizes.width]), tensor(d_wk, &[sizes.width])]);
+    (tensor(d_qkv, &[b, tokens, d3]), d_norms)
 }
 
 /// What the gradient of one head needs of its image.
@@ -232,8 +268,7 @@ struct Saved<'a> {
 /// `d_rows` must be valid for `tokens` rows of `3 d` values, of which nothing else touches this head's columns.
 unsafe fn head_backward(
     saved: Saved<'_>,
-    wq: &[f32],
-    wk: &[f32],
+    weights: Option<Weights<'_>>,
     sizes: Sizes,
     head: usize,
     d_rows: *mut f32,
@@ -246,9 +281,9 @@ unsafe fn head_backward(
     let mut q = vec![0f32; queries * width];
     let mut k = vec![0f32; tokens * width];
     if queries > 0 {
-        normalised(q_rows, stride, wq, factor, &mut q);
+        gather(q_rows, stride, weights.map(|w| w[0]), factor, width, &mut q);
     }
-    normalised(k_rows, stride, wk, 1.0, &mut k);
+    gather(k_rows, stride, weights.map(|w| w[1]), 1.0, width, &mut k);
     let v = Matrix::rows(&saved.rows[sizes.column(2, head)..], stride);
     let (mut dq, mut dk) = (vec![0f32; queries * width], vec![0f32; tokens * width]);
     let (mut p, mut dp) = (vec![0f32; ROWS * tokens], vec![0f32; ROWS * tokens]);
@@ -285,9 +320,9 @@ unsafe fn head_backward(
     }
     let (mut d_wq, mut d_wk) = (vec![0f32; width], vec![0f32; width]);
     if queries > 0 {
-        normalised_backward(q_rows, stride, wq, factor, &mut dq, &mut d_wq);
+        gather_backward(q_rows, stride, weights.map(|w| w[0]), factor, &mut dq, &mut d_wq);
     }
-    normalised_backward(k_rows, stride, wk, 1.0, &mut dk, &mut d_wk);
+    gather_backward(k_rows, stride, weights.map(|w| w[1]), 1.0, &mut dk, &mut d_wk);
     let store = |rows: &[f32], first_token: usize, column: usize| {
         for (i, row) in rows.chunks_exact(width).enumerate() {
             // SAFETY: a row of this head's columns, by the caller's promise.

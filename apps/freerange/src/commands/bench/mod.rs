@@ -1,0 +1,213 @@
+//! `freerange bench`
+
+mod kernels;
+mod timer;
+mod whole;
+
+use burn::tensor::Device;
+use freerange_model::Compute;
+use serde::Serialize;
+
+use crate::{
+    device::{DeviceName, all, parse_compute, require},
+    error::CliError,
+    runtime,
+};
+
+/// Measure speed on a device: the rasteriser, a transformer block, sampling, training.
+///
+/// Prints Markdown tables with the machine, the commit and the command. Weights are random, objects generated. Times are
+/// medians of calls that were waited for.
+#[derive(clap::Args)]
+pub struct Args {
+    /// Where to compute: see `freerange devices`.
+    #[arg(long, default_value = "auto")]
+    device: DeviceName,
+    /// What to measure.
+    #[arg(long, value_enum, value_delimiter = ',', default_values_t = Part::ALL)]
+    only: Vec<Part>,
+    /// Configurations of block, sampling and training: names or files [default: tiny; on a GPU tiny, base and paper].
+    #[arg(long, value_delimiter = ',')]
+    sizes: Vec<String>,
+    /// Gaussians per object, of the rasteriser.
+    #[arg(long, value_delimiter = ',', default_values_t = [2048, 8192, 50_000])]
+    gaussians: Vec<usize>,
+    /// Images per call, of the rasteriser.
+    #[arg(long, value_delimiter = ',', default_values_t = [1, 4, 16, 64])]
+    images: Vec<usize>,
+    /// Image sizes in pixels, of the rasteriser.
+    #[arg(long, value_delimiter = ',', default_values_t = [224, 512])]
+    pixels: Vec<u32>,
+    /// Steps of a whole reconstruction.
+    #[arg(long, default_value_t = 50)]
+    steps: usize,
+    /// Objects per batch of a whole reconstruction.
+    #[arg(long, default_value_t = 1)]
+    objects: usize,
+    /// Arithmetic of the transformer [default: bf16 where the device has it, else f32].
+    #[arg(long, value_parser = parse_compute)]
+    compute: Option<Compute>,
+    /// Seconds to measure each line for, at least three calls.
+    #[arg(long, default_value_t = 1.0)]
+    seconds: f64,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+/// What can be measured.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum Part {
+    /// The rasteriser, forward and with its gradient.
+    Raster,
+    /// Attention and one transformer block.
+    Block,
+    /// Sampling steps and whole reconstructions.
+    Sample,
+    /// Training steps.
+    Train,
+}
+
+impl Part {
+    const ALL: [Self; 4] = [Self::Raster, Self::Block, Self::Sample, Self::Train];
+}
+
+impl std::fmt::Display for Part {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Raster => "raster",
+            Self::Block => "block",
+            Self::Sample => "sample",
+            Self::Train => "train",
+        })
+    }
+}
+
+#[derive(Serialize)]
+struct Report {
+    device: String,
+    hardware: String,
+    commit: String,
+    version: &'static str,
+    command: String,
+    compute: Compute,
+    /// TFLOP/s of a large matrix product in that arithmetic: what "share of peak" refers to.
+    peak_tflops: f64,
+    raster: Vec<kernels::Raster>,
+    block: Vec<kernels::Block>,
+    sample: Vec<whole::Sample>,
+    train: Vec<whole::Train>,
+}
+
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), CliError> {
+    let device = args.device.open()?;
+    let listed = all().into_iter().find(|d| d.is(&device));
+    let (name, hardware, gpu) = listed
+        .map_or_else(|| (args.device.to_string(), "unknown".into(), false), |d| (d.name, d.properties.hardware, d.gpu));
+    let compute = args.compute.unwrap_or(match gpu && Compute::Bf16.supported(&device) {
+        true => Compute::Bf16,
+        false => Compute::F32,
+    });
+    require(compute, &device)?;
+    let sizes = match args.sizes.is_empty() {
+        false => args.sizes.clone(),
+        true if gpu => ["tiny", "base", "paper"].map(String::from).to_vec(),
+        true => vec!["tiny".into()],
+    };
+    let timer = timer::Timer { device: device.clone(), seconds: args.seconds };
+    let mut report = Report {
+        device: name,
+        hardware,
+        commit: runtime::commit(),
+        version: env!("CARGO_PKG_VERSION"),
+        command: std::env::args().collect::<Vec<_>>().join(" "),
+        compute,
+        peak_tflops: timer.peak(compute, gpu)?,
+        raster: Vec::new(),
+        block: Vec::new(),
+        sample: Vec::new(),
+        train: Vec::new(),
+    };
+    let out = Printer { quiet: args.json };
+    out.line(&format!("device: {} ({})", report.device, report.hardware));
+    out.line(&format!("program: freerange {}, commit {}", report.version, report.commit));
+    out.line(&format!("command: {}", report.command));
+    out.line(&format!("peak: {:.2} TFLOP/s in {compute:?} (a large matrix product)", report.peak_tflops));
+    let wants = |part| args.only.contains(&part);
+    if wants(Part::Raster) {
+        out.header(&kernels::Raster::HEADER);
+        for (&gaussians, &pixels) in args.gaussians.iter().flat_map(|n| args.pixels.iter().map(move |p| (n, p))) {
+            for &images in &args.images {
+                let line = kernels::raster(&timer, gaussians, images, pixels)?;
+                out.row(&line.cells());
+                report.raster.push(line);
+            }
+        }
+    }
+    if wants(Part::Block) {
+        out.header(&kernels::Block::HEADER);
+        for size in &sizes {
+            let line = kernels::block(&timer, size, compute, report.peak_tflops)?;
+            out.row(&line.cells());
+            report.block.push(line);
+        }
+    }
+    if wants(Part::Sample) {
+        out.header(&whole::Sample::HEADER);
+        for size in &sizes {
+            let line = whole::sample(&timer, size, args.steps, args.objects, compute, report.peak_tflops)?;
+            out.row(&line.cells());
+            report.sample.push(line);
+        }
+    }
+    if wants(Part::Train) {
+        out.header(&whole::Train::HEADER);
+        for size in &sizes {
+            for line in whole::train(&timer, size, compute, report.peak_tflops)? {
+                out.row(&line.cells());
+                report.train.push(line);
+            }
+        }
+    }
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&report).map_err(CliError::input)?);
+    }
+    Ok(())
+}
+
+/// Writes tables as they grow, unless JSON is wanted.
+struct Printer {
+    quiet: bool,
+}
+
+impl Printer {
+    fn line(&self, text: &str) {
+        if !self.quiet {
+            println!("{text}");
+        }
+    }
+
+    fn header(&self, names: &[&str]) {
+        self.line(&format!("\n| {} |\n|{}", names.join(" | "), "---|".repeat(names.len())));
+    }
+
+    fn row(&self, cells: &[String]) {
+        self.line(&format!("| {} |", cells.join(" | ")));
+    }
+}
+
+/// Milliseconds, three significant digits.
+fn ms(seconds: f64) -> String {
+    let ms = seconds * 1e3;
+    match ms {
+        x if x < 10.0 => format!("{x:.3}"),
+        x if x < 1000.0 => format!("{x:.1}"),
+        x => format!("{x:.0}"),
+    }
+}
+
+/// Bytes that the device's allocator has reserved; none where it does not tell.
+fn reserved(device: &Device) -> Option<u64> {
+    device.memory_pool_usage().map(|usage| usage.bytes_reserved)
+}

@@ -1,0 +1,242 @@
+//! Sampling and training as a whole.
+
+use std::{path::Path, time::Instant};
+
+use burn::tensor::{Distribution, Tensor};
+use freerange_camera::View;
+use freerange_data::{GaussianSource, Object};
+use freerange_flow::{
+    batch::{Conditioning, shrink},
+    config::{Stage, TrainConfig},
+    photometric::{Images, Photometric},
+    sample::{SampleConfig, reconstruct},
+    trainer::Trainer,
+};
+use freerange_model::{Checkpoint, Compute, FreeRange, ModelConfig, ModelInfo, Workload};
+use freerange_splat::Statistics;
+use rand::SeedableRng;
+use serde::Serialize;
+
+use super::{ms, reserved, timer::Timer};
+use crate::error::CliError;
+
+/// Views given to the model: the paper's number.
+const VIEWS: usize = 4;
+
+/// A line about sampling.
+#[derive(Serialize)]
+pub struct Sample {
+    size: String,
+    objects: usize,
+    gaussians: usize,
+    image_size: u32,
+    steps: usize,
+    /// Encoding the images, once.
+    encode_seconds: f64,
+    /// Both branches of the guidance, per step.
+    transformer_seconds: f64,
+    /// Render, compare, and the gradient; there are two of these per step.
+    gradient_seconds: f64,
+    /// All steps, and what comes before and after.
+    whole_seconds: f64,
+    /// Share of the device's peak that the whole run's matrix products make.
+    share: f64,
+}
+
+impl Sample {
+    pub const HEADER: [&str; 9] = [
+        "size",
+        "objects x Gaussians, images",
+        "steps",
+        "encode, ms",
+        "transformer, ms/step",
+        "photometric gradient, ms (two per step)",
+        "whole, s",
+        "whole, ms/step",
+        "of peak",
+    ];
+
+    pub fn cells(&self) -> [String; 9] {
+        [
+            self.size.clone(),
+            format!("{} x {}, {VIEWS} x {} px", self.objects, self.gaussians, self.image_size),
+            self.steps.to_string(),
+            ms(self.encode_seconds),
+            ms(self.transformer_seconds),
+            ms(self.gradient_seconds),
+            format!("{:.2}", self.whole_seconds),
+            ms(self.whole_seconds / self.steps as f64),
+            format!("{:.0} %", 100.0 * self.share),
+        ]
+    }
+}
+
+/// The configuration with objects that are quick to make.
+fn load(size: &str) -> Result<TrainConfig, CliError> {
+    let mut config = TrainConfig::load(Path::new(size))?;
+    config.data.shards = None;
+    config.data.object.gaussians = GaussianSource::Surface;
+    config.data.object.polish = 0;
+    let most = config.stages.iter().map(|s| 1usize << s.depth).max().unwrap_or(1);
+    config.data.object.surface.points = config.data.object.surface.points.max(2 * most);
+    config.data.object.views = config.loss.input_views.1.max(VIEWS) + config.loss.held_views;
+    Ok(config)
+}
+
+/// Times sampling at the last stage of a configuration.
+pub fn sample(
+    timer: &Timer,
+    size: &str,
+    steps: usize,
+    objects: usize,
+    compute: Compute,
+    peak_tflops: f64,
+) -> Result<Sample, CliError> {
+    let config = load(size)?;
+    let (stage, device) = (config.stage(u64::MAX).clone(), &timer.device);
+    let model_config = ModelConfig { image_size: stage.image_size, ..config.model.clone() };
+    let object = Object::generate(7, &config.data.object, &[stage.depth])?;
+    let mut statistics = Statistics::default();
+    statistics.add(object.slice(stage.depth)?)?;
+    let rng = &mut rand_chacha::ChaCha8Rng::seed_from_u64(1);
+    let checkpoint = Checkpoint {
+        model: FreeRange::new(&model_config, rng, device)?,
+        config: model_config.clone(),
+        normalization: statistics.normalization()?,
+        gradient_rms: [1.0; 14],
+        depth: stage.depth,
+        provenance: serde_json::Value::Null,
+    };
+    let views: Vec<View> = object.views[..VIEWS].to_vec();
+    let batch: Vec<&[View]> = vec![&views; objects];
+    let settings = SampleConfig { steps, compute, ..config.sample.clone() };
+
+    // The parts of a step.
+    let (b, n) = (objects, 1usize << stage.depth);
+    let seen: Vec<Vec<&View>> = vec![views.iter().collect(); b];
+    let model = checkpoint.model.clone().with_compute(compute);
+    let conditioning = Conditioning::new(&seen, &model_config, device)?;
+    let encode_seconds = timer.time(|| Ok(conditioning.clone().encode(&model)))?;
+    let tokens = conditioning.encode(&model);
+    let both = Tensor::cat(vec![tokens.clone(), tokens.zeros_like()], 0);
+    let normal = |b: usize| Tensor::<3>::random([b, n, 14], Distribution::Normal(0.0, 1.0), device);
+    let (z, hint, t) = (normal(2 * b), normal(2 * b), Tensor::<1>::full([2 * b], 0.5, device));
+    let hint = model_config.gradient_channels.then_some(hint);
+    let transformer_seconds = timer.time(|| Ok(model.denoise(z.clone(), hint.clone(), both.clone(), t.clone())))?;
+    let small: Vec<View> = views.iter().map(|v| shrink(v, settings.gradient_size)).collect();
+    let images = Images::new(&vec![small.iter().collect(); b], device)?;
+    let photometric = Photometric::new(&checkpoint.normalization, device);
+    let start = normal(b);
+    let gradient_seconds = timer.time(|| Ok(photometric.gradient(start.clone(), &images.on(&vec![[0.5; 3]; b]))?))?;
+
+    // The whole, as `reconstruct` does it. One step first: every kernel is compiled by then.
+    let run =
+        |steps| reconstruct(&checkpoint, &batch, &SampleConfig { steps, ..settings.clone() }, &[0], device, |_| {});
+    run(1)?;
+    let begin = Instant::now();
+    run(steps)?;
+    let whole_seconds = begin.elapsed().as_secs_f64();
+    let info = ModelInfo::new(&model_config, Workload { batch: 2 * b, views: VIEWS, gaussians: n });
+    let flops = info.encoder_flops / 2.0 + steps as f64 * info.forward_flops;
+    Ok(Sample {
+        size: size.into(),
+        objects,
+        gaussians: n,
+        image_size: stage.image_size,
+        steps,
+        encode_seconds,
+        transformer_seconds,
+        gradient_seconds,
+        whole_seconds,
+        share: flops / whole_seconds / (peak_tflops * 1e12),
+    })
+}
+
+/// A line about training.
+#[derive(Serialize)]
+pub struct Train {
+    size: String,
+    depth: u32,
+    image_size: u32,
+    batch: usize,
+    recompute: bool,
+    seconds: f64,
+    data_seconds: f64,
+    tflops: f64,
+    share: f64,
+    predicted_bytes: u64,
+    reserved_bytes: Option<u64>,
+}
+
+impl Train {
+    pub const HEADER: [&str; 8] = [
+        "size",
+        "batch x Gaussians, images",
+        "s/step",
+        "of it waiting for data",
+        "TFLOP/s",
+        "of peak",
+        "memory predicted, GiB",
+        "reserved, GiB",
+    ];
+
+    pub fn cells(&self) -> [String; 8] {
+        let gib = |bytes: u64| format!("{:.2}", bytes as f64 / f64::from(1 << 30));
+        [
+            format!("{}{}", self.size, if self.recompute { ", blocks computed twice" } else { "" }),
+            format!("{} x {}, {} px", self.batch, 1usize << self.depth, self.image_size),
+            format!("{:.3}", self.seconds),
+            format!("{:.3}", self.data_seconds),
+            format!("{:.2}", self.tflops),
+            format!("{:.0} %", 100.0 * self.share),
+            gib(self.predicted_bytes),
+            self.reserved_bytes.map_or_else(|| "unknown".into(), gib),
+        ]
+    }
+}
+
+/// Times training steps at every stage of a configuration.
+pub fn train(timer: &Timer, size: &str, compute: Compute, peak_tflops: f64) -> Result<Vec<Train>, CliError> {
+    let config = load(size)?;
+    let mut lines = Vec::new();
+    for stage in &config.stages {
+        let mut one = config.clone();
+        one.stages = vec![Stage { steps: u64::MAX / 2, ..stage.clone() }];
+        one.data.statistics_objects = 4;
+        one.data.window = stage.batch.min(8);
+        one.data.fresh = 0;
+        one.optimizer.compute = compute;
+        let folder = tempfile::tempdir().map_err(|e| CliError::failure(format!("no temporary folder: {e}")))?;
+        let mut trainer = Trainer::open(one, folder.path(), None, &timer.device, |_| {})?;
+        for _ in 0..2 {
+            trainer.step()?;
+        }
+        let (begin, mut times) = (Instant::now(), Vec::new());
+        while times.len() < 3 || (times.len() < 50 && begin.elapsed().as_secs_f64() < timer.seconds) {
+            times.push(trainer.step()?);
+        }
+        times.sort_by(|a, b| a.seconds.total_cmp(&b.seconds));
+        let middle = &times[times.len() / 2];
+        let model = ModelConfig { image_size: stage.image_size, ..config.model.clone() };
+        let workload = Workload { batch: stage.batch, views: config.loss.input_views.1, gaussians: 1 << stage.depth };
+        let info = ModelInfo::new(&model, workload);
+        let recompute = config.optimizer.recompute;
+        let flops = info.encoder_flops + if recompute { 4.0 } else { 3.0 } * info.forward_flops;
+        let tflops = flops / middle.seconds / 1e12;
+        lines.push(Train {
+            size: size.into(),
+            depth: stage.depth,
+            image_size: stage.image_size,
+            batch: stage.batch,
+            recompute,
+            seconds: middle.seconds,
+            data_seconds: middle.data_seconds,
+            tflops,
+            share: tflops / peak_tflops,
+            predicted_bytes: info.state_bytes
+                + if recompute { info.recomputed_activation_bytes } else { info.activation_bytes },
+            reserved_bytes: reserved(&timer.device),
+        });
+    }
+    Ok(lines)
+}
