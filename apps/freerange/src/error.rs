@@ -65,6 +65,7 @@ macro_rules! input_errors {
 input_errors!(
     freerange_camera::CameraError,
     freerange_data::DataError,
+    freerange_eval::EvalError,
     freerange_fit::FitError,
     freerange_mesh::MeshError,
     freerange_metrics::MetricsError,

@@ -28,6 +28,8 @@ pub struct Options {
     pub refine: usize,
     /// Which way is up in the user's frame.
     pub up: Up,
+    /// Show no progress: the caller has a bar of its own.
+    pub quiet: bool,
 }
 
 /// One sample.
@@ -65,11 +67,15 @@ pub fn run(
     seconds.push(("frame", begin.elapsed().as_secs_f64()));
 
     let begin = Instant::now();
-    let mut bar = Progress::new("sampling", options.sample.steps as u64);
+    let bar = |label: &str, total: usize| match options.quiet {
+        true => Progress::silent(),
+        false => Progress::new(label, total as u64),
+    };
+    let mut sampling = bar("sampling", options.sample.steps);
     let clouds = reconstruct(checkpoint, &[&canonical], &options.sample, &options.seeds, device, |step| {
-        bar.at(step.index as u64, "");
+        sampling.at(step.index as u64, "");
     })?;
-    bar.finish();
+    sampling.finish();
     seconds.push(("sample", begin.elapsed().as_secs_f64()));
 
     let begin = Instant::now();
@@ -78,7 +84,7 @@ pub fn run(
         let refined = match options.refine {
             0 => plain.clone(),
             steps => {
-                let mut bar = Progress::new("refining", steps as u64);
+                let mut bar = bar("refining", steps);
                 let config = RefineConfig { steps, seed, ..RefineConfig::default() };
                 let refined = refine(&plain, &canonical, &config, |p| {
                     bar.at(p.step as u64, &format!("loss {:.4}", p.loss));

@@ -15,4 +15,4 @@ pub use error::{CameraError, Place};
 pub use frame::{CanonicalFrame, FrameConfig, Similarity, Up, canonical_from_user};
 pub use plucker::{PatchLayout, plucker};
 pub use scene::{Scene, load_cameras, transforms_json};
-pub use selection::{SelectionConfig, ViewSets, k_means, select_views};
+pub use selection::{SelectionConfig, ViewSets, inputs_around, inputs_beside, k_means, select_views};

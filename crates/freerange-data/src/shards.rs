@@ -78,6 +78,11 @@ impl Shards {
         &self.manifest
     }
 
+    /// The name of object number `index`.
+    pub fn id(&self, index: u64) -> &str {
+        &self.locate(index).1.id
+    }
+
     /// Bytes of object number `index` in its shard.
     pub fn object_size(&self, index: u64) -> u64 {
         self.locate(index).1.bytes

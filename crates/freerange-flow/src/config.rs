@@ -205,23 +205,20 @@ pub struct Stage {
     pub steps: u64,
 }
 
-/// The configurations of the repository, which can be named without their path.
-const PRESETS: [(&str, &str); 3] = [
-    ("tiny", include_str!("../../../configs/tiny.toml")),
-    ("base", include_str!("../../../configs/base.toml")),
-    ("paper", include_str!("../../../configs/paper.toml")),
-];
-
 impl TrainConfig {
     /// Reads and checks a configuration: a file, or one of the repository's by its name (`tiny`, `base`, `paper`).
+    ///
+    /// A file may hold only what differs from another one, its `parent`: the name of one of the repository's, or a path
+    /// relative to the file. Tables are merged key by key; lists, the stages among them, are replaced whole.
+    ///
+    /// # Errors
+    /// [`FlowError::Io`]; [`FlowError::State`] where a file is no configuration or parents go in a circle; those of
+    /// [`validate`](Self::validate).
     pub fn load(path: &Path) -> Result<Self, FlowError> {
-        let preset = PRESETS.iter().find(|(name, _)| path.as_os_str() == *name);
-        let text = match preset {
-            Some((_, text)) => text.to_string(),
-            None => std::fs::read_to_string(path).map_err(|source| FlowError::Io { path: path.into(), source })?,
-        };
-        let config: Self =
-            toml::from_str(&text).map_err(|e| FlowError::State { path: path.into(), problem: e.to_string() })?;
+        let table = crate::inherit::load(path)?;
+        let config: Self = table
+            .try_into()
+            .map_err(|e: toml::de::Error| FlowError::State { path: path.into(), problem: e.to_string() })?;
         config.validate()?;
         Ok(config)
     }

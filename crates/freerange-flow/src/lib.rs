@@ -6,6 +6,7 @@ pub mod batch;
 pub mod config;
 pub mod coupling;
 mod error;
+mod inherit;
 pub mod path;
 pub mod photometric;
 pub mod sample;

@@ -8,3 +8,4 @@ pub mod model;
 pub mod reconstruct;
 pub mod render;
 pub mod train;
+pub mod weights;

@@ -131,6 +131,7 @@ impl Sampling {
             seeds: (0..u64::from(samples)).map(|i| self.seed.wrapping_add(i)).collect(),
             refine: self.refine,
             up: self.up(),
+            quiet: false,
         })
     }
 }

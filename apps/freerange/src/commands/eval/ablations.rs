@@ -1,0 +1,166 @@
+//! `freerange eval ablations`
+
+use std::path::PathBuf;
+
+use freerange_eval::{
+    Report, RunFolder,
+    ablation::{Set, Study, Values, Variant, variants},
+};
+use freerange_flow::sample::SampleConfig;
+use serde_json::Value;
+
+use super::{
+    args::RunArgs,
+    methods::{Method, MethodName},
+    runner::{Run, report, work},
+    verdict,
+};
+use crate::{error::CliError, pipeline::Options};
+
+/// Arguments of `eval ablations`.
+#[derive(clap::Args)]
+pub struct Args {
+    #[command(flatten)]
+    run: RunArgs,
+    /// Folder of the results: `default` and one folder per setting, each as `freerange eval` writes it, and
+    /// ablations.md and ablations.json.
+    #[arg(short, long, value_name = "OUT")]
+    output: PathBuf,
+    /// What is varied, one setting at a time.
+    #[arg(
+        long, value_delimiter = ',', value_name = "SETS", value_parser = set,
+        default_value = "guidance,steps,lambda,scale,gradient,inputs,solver"
+    )]
+    sets: Vec<Set>,
+    /// Numbers of steps of the sets `steps` and `solver`.
+    #[arg(long, value_delimiter = ',', value_name = "NUMBERS", default_value = "5,10,20,50,100")]
+    step_counts: Vec<usize>,
+    /// Photometric guidance scales of the set `lambda`.
+    #[arg(long, value_delimiter = ',', value_name = "NUMBERS", default_value = "10,25,50,100,250,500,1000")]
+    lambdas: Vec<f32>,
+    /// Classifier-free guidance scales of the set `scale`.
+    #[arg(long, value_delimiter = ',', value_name = "NUMBERS", default_value = "1.25,1.5,2,3")]
+    scales: Vec<f32>,
+    /// Numbers of input views of the set `inputs`.
+    #[arg(long, value_delimiter = ',', value_name = "NUMBERS", default_value = "2,4,6,9")]
+    input_counts: Vec<usize>,
+    /// Solvers of the set `solver`.
+    #[arg(long, value_delimiter = ',', value_name = "NAMES", default_value = "heun,multistep")]
+    solvers: Vec<String>,
+    /// Print the study as JSON on standard output.
+    #[arg(long)]
+    json: bool,
+}
+
+fn set(text: &str) -> Result<Set, String> {
+    let names: Vec<&str> = Set::ALL.map(Set::name).into();
+    Set::ALL.into_iter().find(|s| s.name() == text).ok_or_else(|| format!("expected one of {}", names.join(", ")))
+}
+
+/// The folder of the default settings.
+const DEFAULT: &str = "default";
+
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), CliError> {
+    let a = &args.run;
+    if a.method != MethodName::Model {
+        return Err(CliError::input("ablations are of the model: expected --method model"));
+    }
+    let inputs = match a.inputs()[..] {
+        [n] => n,
+        _ => return Err(CliError::input("expected one number in --inputs; --input-counts holds those to compare")),
+    };
+    if let Some(n) = args.input_counts.iter().find(|n| !(2..=64).contains(*n)) {
+        return Err(CliError::input(format!("--input-counts: expected 2 to 64, found {n}")));
+    }
+    let device = a.sampling.device.open()?;
+    let (method, checkpoint) = a.open_method(&device)?;
+    let Method::Model { options: default, sha256 } = &method else {
+        return Err(CliError::failure("a model's method expected"));
+    };
+    let values = Values {
+        steps: args.step_counts.clone(),
+        lambda: args.lambdas.clone(),
+        scale: args.scales.clone(),
+        inputs: args.input_counts.clone(),
+        solvers: args.solvers.clone(),
+    };
+    let variants = variants(&args.sets, &values);
+    // All settings are looked at before the first one is worked on.
+    let mut planned: Vec<(Variant, Option<(Options, usize)>)> = Vec::new();
+    for variant in variants {
+        let options = apply(&variant, default)?;
+        let count = variant.inputs.unwrap_or(inputs);
+        let same = options.sample == default.sample && count == inputs;
+        planned.push((variant, (!same).then_some((options, count))));
+    }
+    let shared = a.open_shared(&device, checkpoint, args.json)?;
+    let open = |folder: &str, options: &Options, count: usize| {
+        let method = Method::Model { options: options.clone(), sha256: sha256.clone() };
+        let settings = a.settings(&method, &[count], &shared);
+        let path = args.output.join(folder);
+        let prefix = format!("{folder}: ");
+        let folder = RunFolder::open(&path, &settings, a.restart)?;
+        Ok::<_, CliError>(Run { method, folder, settings, views: a.views.sets(), inputs: vec![count], prefix })
+    };
+    let mut runs = vec![open(DEFAULT, default, inputs)?];
+    let mut place = Vec::new(); // index of each variant's run
+    for (variant, different) in &planned {
+        place.push(match different {
+            None => 0,
+            Some((options, count)) => {
+                runs.push(open(&variant.folder, options, *count)?);
+                runs.len() - 1
+            }
+        });
+    }
+    work(&runs, &shared)?;
+    if a.share.is_some() {
+        println!("this share is done; run again without --share for the report");
+        return Ok(());
+    }
+    let environment = a.environment(&device);
+    let reports = runs.iter().map(|r| report(r, &shared, &environment)).collect::<Result<Vec<Report>, CliError>>()?;
+    if reports[0].measured().next().is_none() {
+        return verdict(&reports[..1]);
+    }
+    let variants = planned.into_iter().zip(place);
+    let variants = variants.map(|((variant, _), i)| {
+        let folder = if i == 0 { DEFAULT.to_owned() } else { variant.folder.clone() };
+        (variant, folder, reports[i].clone())
+    });
+    let study = Study::new(&reports[0], variants.collect(), 0)?;
+    let markdown = document(&study, &environment);
+    let write = |name: &str, text: &str| {
+        let path = args.output.join(name);
+        freerange_splat::write_atomically(&path, |f| std::io::Write::write_all(f, text.as_bytes()))
+            .map_err(|e| CliError::file(&path, e))
+    };
+    let json = serde_json::to_string_pretty(&study).map_err(CliError::input)?;
+    write("ablations.md", &markdown)?;
+    write("ablations.json", &json)?;
+    match args.json {
+        true => println!("{json}"),
+        false => println!("{markdown}\n{}", args.output.join("ablations.md").display()),
+    }
+    verdict(&reports)
+}
+
+/// The default with what a variant changes.
+fn apply(variant: &Variant, default: &Options) -> Result<Options, CliError> {
+    let refuse = |e: &dyn std::fmt::Display| CliError::input(format!("setting `{}`: {e}", variant.name));
+    let value: Value = serde_json::to_value(&default.sample).map_err(|e| refuse(&e))?;
+    let sample: SampleConfig = serde_json::from_value(variant.apply(&value)).map_err(|e| refuse(&e))?;
+    sample.validate().map_err(|e| refuse(&e))?;
+    Ok(Options { sample, ..default.clone() })
+}
+
+fn document(study: &Study, environment: &freerange_eval::Environment) -> String {
+    use freerange_eval::table::escape_markdown;
+    let mut out = format!("# Ablations at test time\n\nCommand: {}\n\n", escape_markdown(&environment.command));
+    for table in study.tables() {
+        out += &table.markdown();
+        out.push('\n');
+    }
+    out
+}

@@ -1,0 +1,223 @@
+//! Arguments that `eval` and `eval ablations` share.
+
+use std::{path::PathBuf, sync::Arc};
+
+use freerange_eval::{Environment, Scorer, ScorerConfig, record::ViewSet};
+use freerange_metrics::Metric;
+use freerange_model::Checkpoint;
+use serde_json::{Value, json};
+
+use super::{
+    methods::{Method, MethodName, fit_config},
+    runner::Shared,
+    sources::SourceArgs,
+};
+use crate::{
+    commands::reconstruct::Sampling,
+    error::CliError,
+    runtime::{checkpoint, checkpoint_sha256, memory, processor},
+};
+
+/// What is evaluated, and how.
+#[derive(clap::Args)]
+pub struct RunArgs {
+    #[command(flatten)]
+    pub source: SourceArgs,
+    /// From where the input views look.
+    #[arg(long, value_enum, default_value = "both")]
+    pub views: Views,
+    /// Numbers of input views. Four are those that the data names; others are chosen among all views that do not score.
+    #[arg(long, value_delimiter = ',', default_value = "4", value_parser = clap::value_parser!(u16).range(2..=64))]
+    pub inputs: Vec<u16>,
+    /// What is measured.
+    #[arg(long, value_enum, default_value = "model")]
+    pub method: MethodName,
+    /// With `--method ply`: a folder with NAME.ply for each object, in the frame of its cameras; for the two view sets
+    /// different ones may lie in its folders `full` and `partial`.
+    #[arg(long, value_name = "DIR")]
+    pub ply: Option<PathBuf>,
+    /// Iterations of `--method fit`.
+    #[arg(long, default_value_t = 2000)]
+    pub fit_iterations: usize,
+    /// Longest side, in pixels, of the images that `--method fit` works on.
+    #[arg(long, default_value_t = 128)]
+    pub fit_size: u32,
+    #[command(flatten)]
+    pub sampling: Sampling,
+    /// Samples per object; numbers are means over them, and their disagreement is reported.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
+    pub samples: u32,
+    /// Metrics to compute; those whose weights are missing are named in the report.
+    #[arg(
+        long,
+        value_delimiter = ',',
+        value_name = "NAMES",
+        default_value = "psnr,ssim,ssim-cropped,lpips-vgg,lpips-alex,dino,dreamsim,fid"
+    )]
+    pub metrics: Vec<Metric>,
+    /// Folder of the metrics' weights; else where `freerange weights fetch` puts them.
+    #[arg(long, value_name = "DIR")]
+    pub weights: Option<PathBuf>,
+    /// Weights of the DINO similarity: dinov2-small, dinov2-base or dinov2-large.
+    #[arg(long, value_name = "NAME", default_value = "dinov2-base")]
+    pub dino: String,
+    /// Throw away what an earlier run has left in the output folder.
+    #[arg(long)]
+    pub restart: bool,
+    /// Picture strips: none, or one per object, with those of the worst and best objects or of all of them within
+    /// report.html.
+    #[arg(long, value_enum, default_value = "extremes")]
+    pub pictures: Pictures,
+    /// Work on share I of N only (from 0) and write no report: several processes or devices can fill one folder. Run once
+    /// more without it at the end.
+    #[arg(long, value_name = "I/N", value_parser = share)]
+    pub share: Option<(usize, usize)>,
+}
+
+/// From where the input views look.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum Views {
+    /// From all around the object.
+    Full,
+    /// All from one side.
+    Partial,
+    /// One after the other.
+    Both,
+}
+
+impl Views {
+    /// The view sets.
+    pub fn sets(self) -> Vec<ViewSet> {
+        match self {
+            Self::Full => vec![ViewSet::Full],
+            Self::Partial => vec![ViewSet::Partial],
+            Self::Both => vec![ViewSet::Full, ViewSet::Partial],
+        }
+    }
+}
+
+/// Which picture strips there are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum Pictures {
+    /// None.
+    None,
+    /// One per object; those of the worst and the best ones within report.html.
+    Extremes,
+    /// One per object, all of them within report.html.
+    All,
+}
+
+fn share(text: &str) -> Result<(usize, usize), String> {
+    let parts = text.split_once('/').and_then(|(i, n)| Some((i.parse().ok()?, n.parse().ok()?)));
+    match parts {
+        Some((i, n)) if i < n => Ok((i, n)),
+        _ => Err("expected I/N with I from 0 to N - 1, as in 0/4".into()),
+    }
+}
+
+impl RunArgs {
+    /// The method, and the checkpoint if it needs one.
+    pub fn open_method(&self, device: &burn::tensor::Device) -> Result<(Method, Option<Arc<Checkpoint>>), CliError> {
+        let refuse = |problem: &str| Err(CliError::input(problem));
+        match (self.method, &self.ply) {
+            (MethodName::Ply, None) => return refuse("--method ply: expected --ply DIR as well"),
+            (MethodName::Ply, Some(folder)) if !folder.is_dir() => {
+                return Err(CliError::file(folder, "expected a folder of .ply files"));
+            }
+            (MethodName::Model | MethodName::Fit | MethodName::White, Some(_)) => {
+                return refuse("--ply DIR goes with --method ply only");
+            }
+            _ => {}
+        }
+        let drawn = matches!(self.method, MethodName::Model | MethodName::Fit);
+        if !drawn && (self.samples > 1 || self.inputs.len() > 1) {
+            return refuse("--method white and ply: expected one sample and one number of inputs, they change nothing");
+        }
+        if self.method != MethodName::Model && self.sampling.refine > 0 {
+            return refuse("--refine goes with --method model only");
+        }
+        Ok(match self.method {
+            MethodName::Model => {
+                let path = self.sampling.checkpoint.as_deref();
+                let checkpoint = checkpoint(path, device)?;
+                let mut options = self.sampling.options(&checkpoint, self.samples)?;
+                options.quiet = true;
+                (Method::Model { options, sha256: checkpoint_sha256(path)? }, Some(Arc::new(checkpoint)))
+            }
+            MethodName::Fit => {
+                let seeds = (0..u64::from(self.samples)).map(|i| self.sampling.seed.wrapping_add(i)).collect();
+                let config = Box::new(fit_config(self.fit_iterations, self.fit_size));
+                (Method::Fit { config, seeds, up: self.sampling.up() }, None)
+            }
+            MethodName::White => (Method::White, None),
+            MethodName::Ply => (Method::Ply(self.ply.clone().unwrap_or_default()), None),
+        })
+    }
+
+    /// Opens everything that runs share.
+    pub fn open_shared(
+        &self,
+        device: &burn::tensor::Device,
+        checkpoint: Option<Arc<Checkpoint>>,
+        quiet: bool,
+    ) -> Result<Shared, CliError> {
+        let source = self.source.open()?;
+        let config = ScorerConfig {
+            metrics: self.metrics.clone(),
+            weights: self.weights.iter().cloned().chain(crate::runtime::weights_folder()).collect(),
+            dino: self.dino.clone(),
+        };
+        #[cfg(feature = "networks")]
+        let scorer = Scorer::open(&config, device)?;
+        #[cfg(not(feature = "networks"))]
+        let scorer = Scorer::open(&config)?;
+        if scorer.metrics().is_empty() {
+            let reasons: Vec<&String> = scorer.missing().values().collect();
+            return Err(CliError::input(format!("no metric can be computed: {reasons:?}")));
+        }
+        Ok(Shared {
+            source,
+            scorer,
+            checkpoint,
+            device: device.clone(),
+            pictures: self.pictures,
+            share: self.share.unwrap_or((0, 1)),
+            quiet,
+        })
+    }
+
+    /// Numbers of inputs, each once.
+    pub fn inputs(&self) -> Vec<usize> {
+        let mut inputs: Vec<usize> = self.inputs.iter().map(|&n| n.into()).collect();
+        inputs.sort_unstable();
+        inputs.dedup();
+        inputs
+    }
+
+    /// What the numbers of a run depend on.
+    pub fn settings(&self, method: &Method, inputs: &[usize], shared: &Shared) -> Value {
+        json!({
+            "source": shared.source.settings(), "method": method.settings(), "views": self.views.sets(),
+            "inputs": inputs, "metrics": shared.scorer.metrics(), "weights": shared.scorer.used_files(),
+        })
+    }
+
+    /// Where and how this process runs.
+    pub fn environment(&self, device: &burn::tensor::Device) -> Environment {
+        let plain = |c: char| c.is_ascii_alphanumeric() || "-_./=:,".contains(c);
+        let quoted = |a: String| if !a.is_empty() && a.chars().all(plain) { a } else { format!("{a:?}") };
+        let arguments = std::env::args_os().skip(1).map(|a| quoted(a.to_string_lossy().into_owned()));
+        Environment {
+            command: std::iter::once("freerange".to_owned()).chain(arguments).collect::<Vec<_>>().join(" "),
+            commits: Vec::new(),
+            processor: processor(),
+            threads: std::thread::available_parallelism().map_or(1, usize::from),
+            memory_bytes: memory(),
+            device: match crate::device::all().into_iter().find(|d| d.is(device)) {
+                Some(d) if d.gpu => format!("{} ({})", d.name, d.properties.hardware),
+                Some(d) => d.name,
+                None => self.sampling.device.to_string(),
+            },
+        }
+    }
+}

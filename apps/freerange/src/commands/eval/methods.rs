@@ -1,0 +1,153 @@
+//! What makes the Gaussians.
+
+use std::{
+    ops::ControlFlow,
+    path::{Path, PathBuf},
+};
+
+use burn::tensor::Device;
+use freerange_camera::View;
+use freerange_eval::record::ViewSet;
+use freerange_fit::{FitConfig, Rates, fit};
+use freerange_model::Checkpoint;
+use freerange_splat::{Cloud, read_ply};
+use serde_json::{Value, json};
+
+use crate::{
+    error::CliError,
+    pipeline::{self, Options, to_user},
+};
+
+/// What is measured.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum MethodName {
+    /// The model.
+    Model,
+    /// 3DGS-MCMC on the input views alone, without a model.
+    Fit,
+    /// No Gaussians at all: a white image.
+    White,
+    /// Gaussians that any other program made: see --ply.
+    Ply,
+}
+
+/// A way to make Gaussians for input views.
+#[derive(Clone)]
+pub enum Method {
+    /// The model.
+    Model {
+        /// How it samples.
+        options: Options,
+        /// SHA-256 of the checkpoint.
+        sha256: String,
+    },
+    /// 3DGS-MCMC; one fit per seed.
+    Fit {
+        /// Its configuration, but for the seed.
+        config: Box<FitConfig>,
+        /// Seeds.
+        seeds: Vec<u64>,
+        /// Which way is up.
+        up: freerange_camera::Up,
+    },
+    /// Nothing.
+    White,
+    /// `NAME.ply` in this folder, or in `full/` and `partial/` below it.
+    Ply(PathBuf),
+}
+
+/// What a method made.
+pub struct Made {
+    /// Seeds and Gaussians in the frame of the object's cameras.
+    pub clouds: Vec<(u64, Cloud)>,
+    /// What the user should know.
+    pub notes: Vec<String>,
+}
+
+/// 3DGS-MCMC as a user without a model would run it, with rates chosen for long fits that start from the hull of a few
+/// masks.
+pub fn fit_config(iterations: usize, size: u32) -> FitConfig {
+    FitConfig {
+        iterations,
+        render_size: Some(size),
+        rates: Rates { mean: 1.5e-3, scale: 5e-3, ..FitConfig::default().rates },
+        final_mean_rate: 1.5e-5,
+        ..FitConfig::default()
+    }
+}
+
+impl Method {
+    /// What it is called in tables.
+    pub fn label(&self) -> String {
+        match self {
+            Self::Model { options, .. } if options.refine > 0 => format!("model, refined {}", options.refine),
+            Self::Model { .. } => "model".into(),
+            Self::Fit { .. } => "3DGS-MCMC fit".into(),
+            Self::White => "white".into(),
+            Self::Ply(folder) => folder.file_name().map_or_else(|| "ply".into(), |n| n.to_string_lossy().into_owned()),
+        }
+    }
+
+    /// What its numbers depend on.
+    pub fn settings(&self) -> Value {
+        match self {
+            Self::Model { options, sha256 } => json!({
+                "name": "model", "checkpoint_sha256": sha256, "sample": options.sample, "seeds": options.seeds,
+                "refine": options.refine, "up": format!("{:?}", options.up).to_lowercase(),
+            }),
+            Self::Fit { config, seeds, up } => json!({
+                "name": "fit", "fit": config, "seeds": seeds, "up": format!("{up:?}").to_lowercase(),
+            }),
+            Self::White => json!({ "name": "white" }),
+            Self::Ply(folder) => json!({ "name": "ply", "folder": folder }),
+        }
+    }
+
+    /// Gaussians for an object.
+    pub fn make(
+        &self,
+        object: &str,
+        views: ViewSet,
+        inputs: &[View],
+        checkpoint: Option<&Checkpoint>,
+        device: &Device,
+    ) -> Result<Made, CliError> {
+        let mut notes = Vec::new();
+        let clouds = match self {
+            Self::Model { options, .. } => {
+                let checkpoint = checkpoint.ok_or_else(|| CliError::failure("a model without a checkpoint"))?;
+                let result = pipeline::run(inputs, checkpoint, options, device)?;
+                notes = result.frame.notes;
+                let frame = result.frame.canonical_from_user;
+                result.samples.into_iter().map(|s| (s.seed, to_user(&s.refined, &frame))).collect()
+            }
+            Self::Fit { config, seeds, up } => {
+                let (frame, canonical) = pipeline::to_canonical(inputs, *up)?;
+                let fitted = |&seed: &u64| {
+                    let config = FitConfig { seed, ..(**config).clone() };
+                    let cloud = fit(&canonical, None, &config, |_| ControlFlow::Continue(()))?;
+                    Ok((seed, to_user(&cloud, &frame.canonical_from_user)))
+                };
+                notes = frame.notes.clone();
+                seeds.iter().map(fitted).collect::<Result<_, CliError>>()?
+            }
+            Self::White => vec![(0, Cloud::default())],
+            Self::Ply(folder) => {
+                let file = read_ply(&ply_file(folder, object, views)?)?;
+                notes = file.notes;
+                vec![(0, file.cloud)]
+            }
+        };
+        Ok(Made { clouds, notes })
+    }
+}
+
+/// `NAME.ply`, in the folder of the view set where there is one.
+fn ply_file(folder: &Path, object: &str, views: ViewSet) -> Result<PathBuf, CliError> {
+    // A name comes from the data; it must not lead out of the folder.
+    if object.is_empty() || object.contains(['/', '\\']) {
+        return Err(CliError::input(format!("expected an object's name without slashes, found {object:?}")));
+    }
+    let own = folder.join(views.to_string());
+    Ok(if own.is_dir() { own } else { folder.to_path_buf() }.join(format!("{object}.ply")))
+}

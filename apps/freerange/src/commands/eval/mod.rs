@@ -1,0 +1,122 @@
+//! `freerange eval`
+
+mod ablations;
+mod args;
+mod compare;
+mod methods;
+mod runner;
+mod sources;
+
+use std::path::{Path, PathBuf};
+
+use freerange_eval::{Report, RunFolder, record::style};
+
+use crate::error::CliError;
+use args::RunArgs;
+use runner::{Run, report, work};
+
+/// Arguments of `eval`.
+#[derive(clap::Args)]
+#[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
+pub struct Args {
+    #[command(subcommand)]
+    command: Option<Command>,
+    #[command(flatten)]
+    run: RunArgs,
+    /// Folder of the results; needed unless --json asks for the report alone.
+    #[arg(short, long, value_name = "OUT")]
+    output: Option<PathBuf>,
+    /// Print the report as JSON on standard output.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(clap::Subcommand)]
+enum Command {
+    /// Compare two reports of the same data object by object.
+    Compare(compare::Args),
+    /// Measure what each setting of sampling is worth, on one checkpoint and one source of objects.
+    Ablations(Box<ablations::Args>),
+}
+
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), CliError> {
+    match &args.command {
+        Some(Command::Compare(args)) => compare::run(args),
+        Some(Command::Ablations(args)) => ablations::run(args),
+        None => evaluate(args),
+    }
+}
+
+fn evaluate(args: &Args) -> Result<(), CliError> {
+    // Without a folder to keep, results lie in one that goes away.
+    let temporary = match (&args.output, args.json) {
+        (Some(_), _) => None,
+        (None, true) => Some(tempfile::tempdir().map_err(CliError::failure)?),
+        (None, false) => return Err(CliError::input("expected -o OUT, a folder for the results, or --json")),
+    };
+    let output: &Path = match (&args.output, &temporary) {
+        (Some(path), _) => path,
+        (None, Some(folder)) => folder.path(),
+        (None, None) => unreachable!("refused above"),
+    };
+    let a = &args.run;
+    let device = a.sampling.device.open()?;
+    let (method, checkpoint) = a.open_method(&device)?;
+    let shared = a.open_shared(&device, checkpoint, args.json)?;
+    let inputs = a.inputs();
+    let settings = a.settings(&method, &inputs, &shared);
+    let folder = RunFolder::open(output, &settings, a.restart)?;
+    let run = Run { method, folder, settings, views: a.views.sets(), inputs, prefix: String::new() };
+    let runs = [run];
+    work(&runs, &shared)?;
+    if a.share.is_some() {
+        println!("this share is done; run again without --share for the report");
+        return Ok(());
+    }
+    let report = report(&runs[0], &shared, &a.environment(&device))?;
+    match args.json {
+        true => println!("{}", serde_json::to_string_pretty(&report).map_err(CliError::input)?),
+        false => print(&report, output),
+    }
+    verdict([&report])
+}
+
+/// What a finished run says on the screen.
+fn print(report: &Report, output: &Path) {
+    for group in report.groups.iter().filter(|g| g.measured > 0) {
+        let mut text = format!("{}, {} inputs, {} objects:", group.views, group.inputs, group.measured);
+        for (name, spread) in &group.metrics {
+            let (label, factor, decimals) = style(name);
+            text += &format!("  {label} {:.decimals$}", factor * spread.interval.mean);
+        }
+        if let Some(fid) = group.fid {
+            text += &format!("  FID {fid:.2}");
+        }
+        println!("{text}  {:.1} s", group.seconds);
+    }
+    for (metric, reason) in &report.not_computed {
+        println!("{metric} not computed: {reason}");
+    }
+    println!("{}", output.join("report.html").display());
+}
+
+/// An error if an object failed, or if there was nothing to measure.
+fn verdict<'a>(reports: impl IntoIterator<Item = &'a Report>) -> Result<(), CliError> {
+    let (mut measured, mut failed, mut skipped) = (0, Vec::new(), None);
+    for report in reports {
+        measured += report.measured().count();
+        failed.extend(report.failures().map(|(case, reason)| format!("{case}: {reason}")));
+        skipped = skipped.or_else(|| report.skipped().next().map(|(case, reason)| format!("{case}: {reason}")));
+    }
+    if let Some(first) = failed.first() {
+        let count = failed.len();
+        return Err(CliError::failure(format!("{count} of {} failed, first {first}", measured + count)));
+    }
+    match (measured, skipped) {
+        (0, Some(first)) => {
+            Err(CliError::input(format!("nothing to evaluate: every object was skipped, first {first}")))
+        }
+        _ => Ok(()),
+    }
+}

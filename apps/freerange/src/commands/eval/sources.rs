@@ -1,0 +1,200 @@
+//! What is evaluated: scene folders, objects in shards, generated objects.
+
+use std::{
+    collections::HashSet,
+    path::{Path, PathBuf},
+};
+
+use freerange_camera::{Scene, View};
+use freerange_data::{BuildConfig, Item, Items, ObjectSource, Shards, Split, Store, render_views};
+use freerange_eval::EvalObject;
+use freerange_flow::config::TrainConfig;
+use serde_json::{Value, json};
+
+use crate::error::CliError;
+
+/// Where the objects come from: one of `--scenes`, `--data`, `--generated`.
+#[derive(clap::Args)]
+pub struct SourceArgs {
+    /// A folder of scene folders, or one scene folder: posed images with view sets as `freerange data views` writes them.
+    #[arg(long, value_name = "DIR", group = "source")]
+    scenes: Option<PathBuf>,
+    /// Objects of shards: a folder or URL.
+    #[arg(long, value_name = "LOCATION", group = "source")]
+    data: Option<String>,
+    /// So many objects made on the fly, which no training has seen.
+    #[arg(long, value_name = "N", group = "source")]
+    generated: Option<u64>,
+    /// File with the input views around the object, within each scene folder.
+    #[arg(long, value_name = "FILE", default_value = "transforms_full.json")]
+    full_file: String,
+    /// File with the input views from one side, within each scene folder.
+    #[arg(long, value_name = "FILE", default_value = "transforms_partial.json")]
+    partial_file: String,
+    /// File with the validation views, within each scene folder.
+    #[arg(long, value_name = "FILE", default_value = "transforms_val.json")]
+    validation_file: String,
+    /// Part of the shards' objects.
+    #[arg(long, value_enum, default_value = "test")]
+    split: SplitName,
+    /// Seed of the first generated object. The default is far from those that training and `data generate` begin with.
+    #[arg(long, default_value_t = 7_000_000_000_000)]
+    first_seed: u64,
+    /// Configuration whose generator, cameras and number of views generated objects have: a file, or tiny, base, paper.
+    #[arg(long, default_value = "tiny")]
+    config: PathBuf,
+    /// Width and height of the views of generated objects in pixels [default: the configuration's].
+    #[arg(long, value_name = "PIXELS", value_parser = clap::value_parser!(u32).range(16..=2048))]
+    generated_size: Option<u32>,
+    /// Take the first N objects only.
+    #[arg(long, value_name = "N")]
+    limit: Option<usize>,
+}
+
+/// A part of the data.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum SplitName {
+    Train,
+    Validation,
+    Test,
+}
+
+/// The objects, by number.
+pub struct Source {
+    kind: Kind,
+    names: Vec<String>,
+    settings: Value,
+}
+
+enum Kind {
+    Scenes { folders: Vec<PathBuf>, files: [String; 3] },
+    Shards(Box<Shards>),
+    Generated { items: Vec<Item>, config: Box<BuildConfig> },
+}
+
+impl SourceArgs {
+    /// Finds the objects; none is loaded yet.
+    pub fn open(&self) -> Result<Source, CliError> {
+        let limit = self.limit.unwrap_or(usize::MAX);
+        let (kind, mut names, mut settings) = match (&self.scenes, &self.data, self.generated) {
+            (Some(folder), None, None) => self.scenes(folder)?,
+            (None, Some(location), None) => {
+                let split = match self.split {
+                    SplitName::Train => Split::Train,
+                    SplitName::Validation => Split::Validation,
+                    SplitName::Test => Split::Test,
+                };
+                let shards = Shards::open(&Store::open(location)?, &[], Some(split))?;
+                let names: Vec<String> = (0..shards.len()).map(|i| shards.id(i as u64).to_owned()).collect();
+                let plan = shards.manifest().plan_sha256.clone();
+                (Kind::Shards(Box::new(shards)), names, json!({ "kind": "data", "plan_sha256": plan, "split": split }))
+            }
+            (None, None, Some(count)) => {
+                let mut config = TrainConfig::load(&self.config)?.build_config();
+                if let Some(size) = self.generated_size {
+                    config.object.cameras.resolution = size;
+                }
+                let all = Items::generated(count.min(limit as u64), self.first_seed);
+                let items: Vec<Item> = (0..all.len()).map_while(|i| all.get(i)).collect();
+                let names = items.iter().map(|i| i.id.clone()).collect();
+                let object = &config.object;
+                let settings = json!({
+                    "kind": "generated", "first_seed": self.first_seed, "views": object.views, "cameras": object.cameras,
+                    "samples_per_axis": object.samples_per_axis, "generator": object.generator,
+                    "lighting": object.lighting, "selection": config.shard.selection,
+                });
+                (Kind::Generated { items, config: Box::new(config) }, names, settings)
+            }
+            _ => return Err(CliError::input("expected one of --scenes DIR, --data LOCATION, --generated N")),
+        };
+        names.truncate(limit);
+        if names.is_empty() {
+            return Err(CliError::input("nothing to evaluate: no objects"));
+        }
+        let mut seen = HashSet::new();
+        if let Some(twice) = names.iter().find(|n| !seen.insert(*n)) {
+            return Err(CliError::input(format!("expected objects with different names, found `{twice}` twice")));
+        }
+        settings["objects"] = json!(names);
+        Ok(Source { kind, names, settings })
+    }
+
+    fn scenes(&self, folder: &Path) -> Result<(Kind, Vec<String>, Value), CliError> {
+        let files = [&self.full_file, &self.partial_file, &self.validation_file].map(Clone::clone);
+        let is_scene = |path: &Path| files.iter().any(|f| path.join(f).is_file());
+        let mut folders = Vec::new();
+        if is_scene(folder) {
+            folders.push(folder.to_path_buf());
+        } else {
+            for entry in std::fs::read_dir(folder).map_err(|e| CliError::file(folder, e))? {
+                let path = entry.map_err(|e| CliError::file(folder, e))?.path();
+                if is_scene(&path) {
+                    folders.push(path);
+                }
+            }
+        }
+        if folders.is_empty() {
+            let expected = format!("nothing to evaluate: expected folders with {}, found none", files.join(" or "));
+            return Err(CliError::file(folder, expected));
+        }
+        folders.sort();
+        let name = |p: &PathBuf| {
+            // `.` and `..` have no name of their own.
+            let whole = p.canonicalize().unwrap_or_else(|_| p.clone());
+            p.file_name().or(whole.file_name()).map_or_else(|| "scene".into(), |n| n.to_string_lossy().into_owned())
+        };
+        let names = folders.iter().map(name).collect();
+        let settings = json!({ "kind": "scenes", "folder": folder, "full": files[0], "partial": files[1], "validation": files[2] });
+        Ok((Kind::Scenes { folders, files }, names, settings))
+    }
+}
+
+impl Source {
+    /// Names of the objects, all different.
+    pub fn names(&self) -> &[String] {
+        &self.names
+    }
+
+    /// What the numbers depend on.
+    pub fn settings(&self) -> &Value {
+        &self.settings
+    }
+
+    /// Object number `index`.
+    pub fn load(&self, index: usize) -> Result<EvalObject, CliError> {
+        let name = &self.names[index];
+        match &self.kind {
+            Kind::Scenes { folders, files } => load_scene(name, &folders[index], files),
+            Kind::Shards(shards) => {
+                let metadata = shards.metadata(index as u64)?;
+                let views = shards.object(index as u64)?.views;
+                let sets = metadata.evaluation.ok_or_else(|| no_sets(name, views.len()))?;
+                Ok(EvalObject::from_sets(name, views, &sets, metadata.seed)?)
+            }
+            Kind::Generated { items, config } => {
+                let (views, sets) = render_views(&items[index], config)?;
+                let sets = sets.ok_or_else(|| no_sets(name, views.len()))?;
+                Ok(EvalObject::from_sets(name, views, &sets, items[index].seed.unwrap_or(0))?)
+            }
+        }
+    }
+}
+
+fn no_sets(name: &str, views: usize) -> CliError {
+    CliError::input(format!("{name}: expected view sets for evaluation, found none: {views} views are too few"))
+}
+
+fn load_scene(name: &str, folder: &Path, [full, partial, validation]: &[String; 3]) -> Result<EvalObject, CliError> {
+    let read = |file: &str| -> Result<Vec<View>, CliError> {
+        let path = folder.join(file);
+        let scene = Scene::load(&path)?;
+        Ok(scene.inputs.into_iter().chain(scene.further).collect())
+    };
+    let if_there = |file: &str| match folder.join(file).is_file() {
+        true => read(file),
+        false => Ok(Vec::new()),
+    };
+    let all = "transforms.json";
+    let further = if [full, partial, validation].iter().any(|f| *f == all) { Vec::new() } else { if_there(all)? };
+    Ok(EvalObject::from_views(name, if_there(full)?, if_there(partial)?, read(validation)?, further)?)
+}

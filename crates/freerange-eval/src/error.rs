@@ -1,0 +1,69 @@
+use std::path::PathBuf;
+
+/// Why something cannot be evaluated or reported.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum EvalError {
+    /// Reading or writing failed.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file or folder.
+        path: PathBuf,
+        /// The reason.
+        source: std::io::Error,
+    },
+    /// A file or folder is not what it should be.
+    #[error("{}: expected {expected}, found {found}", path.display())]
+    File {
+        /// The file or folder.
+        path: PathBuf,
+        /// What it should be.
+        expected: String,
+        /// What it is.
+        found: String,
+    },
+    /// A folder holds results of other settings.
+    #[error(
+        "{} holds results of other settings: {}; choose another folder, or --restart to throw them away",
+        path.display(), differences.join("; ")
+    )]
+    Settings {
+        /// The folder.
+        path: PathBuf,
+        /// One per setting that differs.
+        differences: Vec<String>,
+    },
+    /// An object cannot be used.
+    #[error("{object}: expected {expected}, found {found}")]
+    Object {
+        /// The object's name.
+        object: String,
+        /// What it should be like.
+        expected: String,
+        /// What it is like.
+        found: String,
+    },
+    /// Two reports cannot be compared.
+    #[error("the reports cannot be compared: {0}")]
+    Incomparable(String),
+    /// A picture could not be encoded.
+    #[error("picture: {0}")]
+    Picture(#[from] image::ImageError),
+    /// Cameras or their choice.
+    #[error(transparent)]
+    Camera(#[from] freerange_camera::CameraError),
+    /// A metric.
+    #[error(transparent)]
+    Metrics(#[from] freerange_metrics::MetricsError),
+}
+
+impl EvalError {
+    pub(crate) fn io(path: &std::path::Path) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.to_path_buf();
+        move |source| Self::Io { path, source }
+    }
+
+    pub(crate) fn file(path: &std::path::Path, expected: impl Into<String>, found: impl ToString) -> Self {
+        Self::File { path: path.into(), expected: expected.into(), found: found.to_string() }
+    }
+}

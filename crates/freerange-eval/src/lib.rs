@@ -1,0 +1,26 @@
+//! The evaluation: which views a method is shown and which score it, the scores, what they add up to, and reports.
+//!
+//! Start with [`EvalObject`] (the protocol), [`Scorer`] (the metrics) and [`Report`]. [`RunFolder`] keeps results so that
+//! a run can be stopped and gone on with. What is evaluated, and how it makes its Gaussians, is for the caller to know.
+
+pub mod ablation;
+pub mod compare;
+pub mod document;
+mod error;
+mod folder;
+pub mod html;
+mod object;
+pub mod paper;
+pub mod record;
+mod report;
+mod scorer;
+pub mod statistics;
+mod strip;
+pub mod table;
+
+pub use error::EvalError;
+pub use folder::{RunFolder, differences};
+pub use object::{EvalObject, Inputs};
+pub use report::{Environment, FORMAT, Group, Report, Spread};
+pub use scorer::{HIGHEST_PSNR, Pair, Scorer, ScorerConfig, Scores, UsedFile, fid};
+pub use strip::strip;

@@ -1,0 +1,175 @@
+//! Configurations that say only what differs from another one: `parent = "tiny"`.
+
+use std::path::{Path, PathBuf};
+
+use toml::{Table, Value};
+
+use crate::FlowError;
+
+/// Longest chain of parents.
+const DEEPEST: usize = 32;
+
+/// The configurations of the repository, which can be named without their path.
+pub(crate) const PRESETS: [(&str, &str); 3] = [
+    ("tiny", include_str!("../../../configs/tiny.toml")),
+    ("base", include_str!("../../../configs/base.toml")),
+    ("paper", include_str!("../../../configs/paper.toml")),
+];
+
+/// Reads a configuration and those that it descends from, and merges them: tables key by key, everything else (lists
+/// among it) as the descendant has it. A parent is the name of a preset, or a path relative to the file that names it.
+pub(crate) fn load(path: &Path) -> Result<Table, FlowError> {
+    let mut chain: Vec<(PathBuf, Table)> = Vec::new();
+    let mut next = Some(path.to_path_buf());
+    while let Some(path) = next {
+        let state = |problem: String| FlowError::State { path: path.clone(), problem };
+        let preset = PRESETS.iter().find(|(name, _)| path.as_os_str() == *name);
+        let (identity, text) = match preset {
+            Some((_, text)) => (path.clone(), text.to_string()),
+            None => {
+                let io = |source| FlowError::Io { path: path.clone(), source };
+                (path.canonicalize().map_err(io)?, std::fs::read_to_string(&path).map_err(io)?)
+            }
+        };
+        if chain.iter().any(|(seen, _)| *seen == identity) {
+            let names: Vec<String> = chain.iter().map(|(seen, _)| seen.display().to_string()).collect();
+            return Err(state(format!("expected parents that end, found a circle: {}", names.join(" -> "))));
+        }
+        if chain.len() == DEEPEST {
+            return Err(state(format!("expected at most {DEEPEST} parents in a row")));
+        }
+        let mut table: Table = text.parse().map_err(|e: toml::de::Error| state(e.to_string()))?;
+        next = match table.remove("parent") {
+            None => None,
+            Some(Value::String(name)) if PRESETS.iter().any(|(preset, _)| *preset == name) => Some(name.into()),
+            Some(Value::String(name)) if preset.is_none() => Some(path.parent().unwrap_or(Path::new("")).join(name)),
+            Some(other) => {
+                let expected = "the name of a preset or a path relative to this file";
+                return Err(state(format!("field `parent`: expected {expected}, found {other}")));
+            }
+        };
+        chain.push((identity, table));
+    }
+    let oldest_first = chain.into_iter().rev().map(|(_, table)| table);
+    Ok(oldest_first.reduce(merged).unwrap_or_default())
+}
+
+/// `over` laid over `under`.
+fn merged(mut under: Table, over: Table) -> Table {
+    for (key, value) in over {
+        let value = match (under.remove(&key), value) {
+            (Some(Value::Table(a)), Value::Table(b)) => Value::Table(merged(a, b)),
+            (_, value) => value,
+        };
+        under.insert(key, value);
+    }
+    under
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+    use crate::config::TrainConfig;
+
+    fn place(files: &[(&str, &str)]) -> tempfile::TempDir {
+        let folder = tempfile::tempdir().unwrap();
+        for (name, text) in files {
+            let path = folder.path().join(name);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, text).unwrap();
+        }
+        folder
+    }
+
+    #[test]
+    fn a_descendant_changes_what_it_says_and_nothing_else() {
+        let files = [
+            ("a/child.toml", "parent = \"../b/middle.toml\"\nloss.held_views = 1\n"),
+            ("b/middle.toml", "parent = \"tiny\"\nseed = 7\n[loss]\nseen = false\n"),
+        ];
+        let folder = place(&files);
+        let found = TrainConfig::load(&folder.path().join("a/child.toml")).unwrap();
+        let mut expected = TrainConfig::load(Path::new("tiny")).unwrap();
+        expected.seed = 7;
+        expected.loss.seen = false;
+        expected.loss.held_views = 1;
+        assert_eq!(found, expected);
+    }
+
+    #[test]
+    fn lists_are_replaced_whole() {
+        let stage = "stage = [{ depth = 8, image_size = 96, batch = 2, steps = 3 }]";
+        let folder = place(&[("c.toml", &format!("parent = \"tiny\"\n{stage}\n"))]);
+        let found = TrainConfig::load(&folder.path().join("c.toml")).unwrap();
+        assert_eq!(found.stages.len(), 1);
+        assert_eq!((found.stages[0].steps, found.total_steps()), (3, 3));
+    }
+
+    #[test]
+    fn bad_parents_are_refused_with_their_file() {
+        let files = [
+            ("self.toml", "parent = \"self.toml\""),
+            ("x.toml", "parent = \"y.toml\""),
+            ("y.toml", "parent = \"./x.toml\""),
+            ("orphan.toml", "parent = \"nowhere.toml\""),
+            ("number.toml", "parent = 3"),
+            ("broken.toml", "parent = \"half.toml\""),
+            ("half.toml", "seed = "),
+            ("typo.toml", "parent = \"tiny\"\nloss.hold = false"),
+            ("scalar.toml", "parent = \"tiny\"\nloss = 3"),
+        ];
+        let folder = place(&files);
+        let error = |name: &str| TrainConfig::load(&folder.path().join(name)).unwrap_err().to_string();
+        for name in ["self.toml", "x.toml", "y.toml"] {
+            assert!(error(name).contains("circle"), "{}", error(name));
+        }
+        for (name, words) in [
+            ("orphan.toml", "nowhere.toml"),
+            ("number.toml", "`parent`"),
+            ("broken.toml", "half.toml"),
+            ("typo.toml", "hold"),
+            ("scalar.toml", "loss"),
+        ] {
+            assert!(error(name).contains(words), "{name}: {}", error(name));
+        }
+        let long: Vec<(String, String)> =
+            (0..40).map(|i| (format!("{i}.toml"), format!("parent = \"{}.toml\"", i + 1))).collect();
+        let long: Vec<(&str, &str)> = long.iter().map(|(a, b)| (a.as_str(), b.as_str())).collect();
+        let folder = place(&long);
+        let error = TrainConfig::load(&folder.path().join("0.toml")).unwrap_err().to_string();
+        assert!(error.contains("at most 32"), "{error}");
+    }
+
+    /// Fields of `a` and `b` that differ, by path. The steps of a curriculum are one field.
+    fn differences(a: &serde_json::Value, b: &serde_json::Value, path: &str) -> Vec<String> {
+        let (serde_json::Value::Object(x), serde_json::Value::Object(y)) = (a, b) else {
+            return if a == b { Vec::new() } else { vec![path.to_owned()] };
+        };
+        let keys: std::collections::BTreeSet<&String> = x.keys().chain(y.keys()).collect();
+        let (null, place) = (serde_json::Value::Null, |key: &String| format!("{path}.{key}"));
+        let of = |key: &String| differences(x.get(key).unwrap_or(&null), y.get(key).unwrap_or(&null), &place(key));
+        keys.into_iter().flat_map(of).collect()
+    }
+
+    #[test]
+    fn every_ablation_differs_from_its_parent_in_one_field() {
+        let folder = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/ablations"));
+        let mut count = 0;
+        for entry in fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            let text: Table = fs::read_to_string(&path).unwrap().parse().unwrap();
+            let parent = text["parent"].as_str().unwrap();
+            let parent = match PRESETS.iter().any(|(name, _)| *name == parent) {
+                true => PathBuf::from(parent),
+                false => folder.join(parent),
+            };
+            let json = |path: &Path| serde_json::to_value(TrainConfig::load(path).unwrap()).unwrap();
+            let found = differences(&json(&parent), &json(&path), "");
+            assert_eq!(found.len(), 1, "{}: {found:?}", path.display());
+            count += 1;
+        }
+        assert!(count >= 10, "{count}");
+    }
+}
