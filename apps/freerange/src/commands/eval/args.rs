@@ -140,7 +140,7 @@ impl RunArgs {
             MethodName::Model => {
                 let path = self.sampling.checkpoint.as_deref();
                 let checkpoint = checkpoint(path, device)?;
-                let mut options = self.sampling.options(&checkpoint, self.samples)?;
+                let mut options = self.sampling.options(&checkpoint, self.samples, device)?;
                 options.quiet = true;
                 (Method::Model { options, sha256: checkpoint_sha256(path)? }, Some(Arc::new(checkpoint)))
             }

@@ -1,11 +1,15 @@
 use std::{collections::HashMap, path::PathBuf};
 
 use burn::tensor::Tensor;
+use sha2::{Digest, Sha256};
 
 use super::{Vectors, close, device, golden, json, uniform};
 use crate::{
     MetricsError,
-    networks::{Lpips, LpipsNet, host, source::Source},
+    networks::{
+        Lpips, LpipsNet, host,
+        source::{Source, TensorFile},
+    },
 };
 
 /// Weights by the rule that the vectors' JSON states.
@@ -72,6 +76,21 @@ fn alexnet() {
 #[test]
 fn vgg() {
     check(LpipsNet::Vgg, golden("lpips_vgg_procedural_3103.safetensors"), true);
+}
+
+#[test]
+fn published_heads_are_read() {
+    // As its authors ship it (R. Zhang et al., BSD-2-Clause): the format before PyTorch 1.6, saved on a GPU.
+    let path = golden("networks/lpips_alex_v0.1.pth");
+    let published = crate::weights::set("lpips-alex").unwrap().files[1].sha256;
+    let hash: String = Sha256::digest(std::fs::read(&path).unwrap()).iter().map(|b| format!("{b:02x}")).collect();
+    assert_eq!(hash, published);
+    let mut file = TensorFile::open(&path, None).unwrap();
+    let v = Vectors::open(&golden("lpips_alex_procedural_3102.safetensors"));
+    for (i, channels) in [64, 192, 384, 256, 256].into_iter().enumerate() {
+        let found = file.values(&format!("lin{i}.model.1.weight"), &[1, channels, 1, 1]).unwrap();
+        assert_eq!(found, v.values(&format!("lin{i}")));
+    }
 }
 
 #[test]

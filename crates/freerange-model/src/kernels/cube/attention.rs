@@ -11,8 +11,9 @@ use burn_cubecl::{
 use super::{
     super::AttentionGrads,
     dims, empty, flash,
-    heads::{Sizes, merge, merge_backward, put, split, split_backward},
+    heads::{Sizes, split, split_backward},
     linear::{cast, matmul, transposed},
+    merge::{merge, merge_backward, put},
     shaped,
     softmax::{softmax, softmax_backward},
 };

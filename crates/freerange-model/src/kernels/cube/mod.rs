@@ -12,6 +12,8 @@ mod attention;
 mod flash;
 mod heads;
 mod linear;
+mod merge;
+mod norm;
 mod pointwise;
 mod reduce;
 mod softmax;
@@ -147,11 +149,11 @@ impl Kernels for CubeBackend {
     }
 
     fn modulated_norm_forward(x: CubeTensor, shift: CubeTensor, scale: CubeTensor, compute: Compute) -> CubeTensor {
-        pointwise::modulated_norm(x, shift, scale, compute.dtype())
+        norm::modulated_norm(x, shift, scale, compute.dtype())
     }
 
     fn modulated_norm_backward(x: CubeTensor, scale: CubeTensor, grad: CubeTensor) -> Grads<Self, 3> {
-        pointwise::modulated_norm_backward(x, scale, grad)
+        norm::modulated_norm_backward(x, scale, grad)
     }
 
     fn gated_add_forward(x: CubeTensor, gate: CubeTensor, y: Product<Self>) -> CubeTensor {

@@ -151,7 +151,7 @@ pub fn total(x: CubeTensor) -> CubeTensor {
 fn rows_kernel<E: Float, N: Size>(
     x: &Tensor<Vector<E, N>>,
     out: &mut Tensor<Vector<f32, N>>,
-    n: usize,
+    count: usize,
     vectors: usize,
     rows: usize,
     #[define(E)] _dtype: ElemType,
@@ -159,7 +159,7 @@ fn rows_kernel<E: Float, N: Size>(
     let column = ABSOLUTE_POS_X as usize;
     let piece = CUBE_POS_Y as usize;
     if column < vectors {
-        let last = usize::min((piece + 1) * rows, n);
+        let last = usize::min((piece + 1) * rows, count);
         let mut sum = Vector::<f32, N>::new(0.0f32);
         for row in piece * rows..last {
             sum += Vector::cast_from(x[row * vectors + column]);
