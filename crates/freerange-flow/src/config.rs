@@ -223,6 +223,11 @@ impl TrainConfig {
         Ok(config)
     }
 
+    /// Whether this names a configuration of the repository.
+    pub fn is_preset(path: &Path) -> bool {
+        crate::inherit::PRESETS.iter().any(|(name, _)| path.as_os_str() == *name)
+    }
+
     /// All steps of all stages.
     pub fn total_steps(&self) -> u64 {
         self.stages.iter().map(|s| s.steps).sum()

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use freerange_flow::config::TrainConfig;
-use freerange_model::{ModelConfig, ModelInfo, Workload};
+use freerange_model::{Compute, Execution, ModelConfig, ModelInfo, Workload};
 
 use crate::{error::CliError, runtime};
 
@@ -27,6 +27,9 @@ pub struct Info {
     /// Input images per sample.
     #[arg(long, default_value_t = 4)]
     views: usize,
+    /// Memory as on a GPU, where activations can be of 16 bits, and scores are held in larger pieces.
+    #[arg(long)]
+    gpu: bool,
     /// Print JSON.
     #[arg(long)]
     json: bool,
@@ -53,44 +56,28 @@ pub fn run(command: &Command) -> Result<(), CliError> {
 }
 
 fn info(args: &Info) -> Result<(), CliError> {
-    let is_configuration = args.file.as_ref().is_some_and(|f| f.extension().is_some_and(|e| e == "toml"));
-    let (model, depth, batch, provenance) = match (&args.file, is_configuration) {
+    let is_configuration =
+        args.file.as_ref().is_some_and(|f| f.extension().is_some_and(|e| e == "toml") || TrainConfig::is_preset(f));
+    let (model, depth, batch, compute, recompute, provenance) = match (&args.file, is_configuration) {
         (Some(file), true) => {
             let config = TrainConfig::load(file)?;
             let stage = config.stages.last().ok_or_else(|| CliError::input("a configuration without stages"))?.clone();
-            (ModelConfig { image_size: stage.image_size, ..config.model }, stage.depth, stage.batch, None)
+            let model = ModelConfig { image_size: stage.image_size, ..config.model };
+            (model, stage.depth, stage.batch, config.optimizer.compute, config.optimizer.recompute, None)
         }
         (file, _) => {
             let c = runtime::checkpoint(file.as_deref(), &burn::tensor::Device::flex())?;
-            (c.config, c.depth, 1, Some(c.provenance))
+            (c.config, c.depth, 1, Compute::F32, false, Some(c.provenance))
         }
     };
     let workload = Workload { batch: args.batch.unwrap_or(batch), views: args.views, gaussians: 1 << depth };
-    let info = ModelInfo::new(&model, workload);
+    let execution = Execution { gpu: args.gpu, compute, recompute };
+    let info = ModelInfo::with_execution(&model, workload, execution);
     if args.json {
         println!("{}", serde_json::to_string_pretty(&info).map_err(CliError::input)?);
         return Ok(());
     }
-    println!("{:28} {:>14}  shape", "part", "parameters");
-    for part in &info.parts {
-        println!("{:28} {:>14}  {}", part.name, part.parameters, part.shape);
-    }
-    println!("{:28} {:>14}", "trained", info.trainable);
-    println!("{:28} {:>14}", "frozen", info.frozen);
-    let w = info.workload;
-    println!(
-        "\n{} sample(s), {} views of {} px, {} Gaussians: {} tokens",
-        w.batch, w.views, model.image_size, w.gaussians, info.tokens
-    );
-    println!("encoding the images  {:10.3} TFLOP", info.encoder_flops / 1e12);
-    println!("one forward pass     {:10.3} TFLOP (a training step about three times that)", info.forward_flops / 1e12);
-    let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
-    println!("weights, gradients, Adam: {:.2} GiB", gib(info.state_bytes));
-    println!(
-        "activations of a training step: {:.2} GiB; {:.2} GiB if blocks are computed again in the backward pass",
-        gib(info.activation_bytes),
-        gib(info.recomputed_activation_bytes)
-    );
+    println!("{info}");
     if let Some(provenance) = provenance {
         println!("\n{}", serde_json::to_string_pretty(&provenance).map_err(CliError::input)?);
     }

@@ -12,7 +12,7 @@ use freerange_flow::{
     sample::{SampleConfig, reconstruct},
     trainer::Trainer,
 };
-use freerange_model::{Checkpoint, Compute, FreeRange, ModelConfig, ModelInfo, Workload};
+use freerange_model::{Checkpoint, Compute, Execution, FreeRange, ModelConfig, ModelInfo, Workload};
 use freerange_splat::Statistics;
 use rand::SeedableRng;
 use serde::Serialize;
@@ -219,8 +219,9 @@ pub fn train(timer: &Timer, size: &str, compute: Compute, peak_tflops: f64) -> R
         let middle = &times[times.len() / 2];
         let model = ModelConfig { image_size: stage.image_size, ..config.model.clone() };
         let workload = Workload { batch: stage.batch, views: config.loss.input_views.1, gaussians: 1 << stage.depth };
-        let info = ModelInfo::new(&model, workload);
         let recompute = config.optimizer.recompute;
+        let execution = Execution { gpu: timer.device != burn::tensor::Device::flex(), compute, recompute };
+        let info = ModelInfo::with_execution(&model, workload, execution);
         let flops = info.encoder_flops + if recompute { 4.0 } else { 3.0 } * info.forward_flops;
         let tflops = flops / middle.seconds / 1e12;
         lines.push(Train {
@@ -233,8 +234,7 @@ pub fn train(timer: &Timer, size: &str, compute: Compute, peak_tflops: f64) -> R
             data_seconds: middle.data_seconds,
             tflops,
             share: tflops / peak_tflops,
-            predicted_bytes: info.state_bytes
-                + if recompute { info.recomputed_activation_bytes } else { info.activation_bytes },
+            predicted_bytes: info.step_bytes,
             reserved_bytes: reserved(&timer.device),
         });
     }
