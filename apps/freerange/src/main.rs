@@ -67,7 +67,8 @@ fn main() -> ExitCode {
     #[cfg(unix)]
     end_with_a_closed_pipe();
     let cli = Cli::parse();
-    let level = if cli.verbose { "debug" } else { "warn" };
+    // CubeCL tries several kernels for each job and reports each that a device cannot run; what matters ends as an error.
+    let level = if cli.verbose { "debug" } else { "warn,cubecl_runtime=off,cubecl_wgpu=off" };
     let filter = tracing_subscriber::EnvFilter::try_from_default_env().unwrap_or_else(|_| level.into());
     tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
     let result = match cli.command {

@@ -34,7 +34,9 @@ fn status(name: &str) -> u64 {
 #[test]
 #[ignore = "a child process of the other test"]
 fn child() {
-    let recompute = std::env::var(CHILD).expect("run by the other test") == "true";
+    // Also started by whoever runs all ignored tests: then there is nothing to measure.
+    let Ok(recompute) = std::env::var(CHILD) else { return };
+    let recompute = recompute == "true";
     let device = Device::flex().autodiff();
     let config = config();
     let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(1);

@@ -33,8 +33,11 @@ pub(crate) struct TensorFile {
     tensors: Tensors,
 }
 
+/// Shapes and values by name.
+type ReadTensors = HashMap<String, (Vec<usize>, Vec<f32>)>;
+
 enum Tensors {
-    Read(HashMap<String, (Vec<usize>, Vec<f32>)>),
+    Read(ReadTensors),
     Lazy(HashMap<String, pytorch_reader::Tensor>),
 }
 
@@ -112,7 +115,7 @@ fn finite(values: Vec<f32>) -> Result<Vec<f32>, f32> {
     }
 }
 
-fn read_safetensors(path: &Path) -> Result<HashMap<String, (Vec<usize>, Vec<f32>)>, MetricsError> {
+fn read_safetensors(path: &Path) -> Result<ReadTensors, MetricsError> {
     let bytes = std::fs::read(path).map_err(|e| MetricsError::io(path, e))?;
     let file = SafeTensors::deserialize(&bytes).map_err(|e| MetricsError::format(path, "safetensors file", e))?;
     let mut out = HashMap::new();
