@@ -7,7 +7,8 @@
 
 The scene of the rasteriser is that of `freerange bench` (apps/freerange/src/commands/bench/kernels.rs). The PyTorch block is
 the same arithmetic: adaLN-Zero, RMS norm of queries and keys, scaled_dot_product_attention, GEGLU; autocast to bf16 around
-a residual stream of 32 bits; compiled with torch.compile. Times are medians of calls that were waited for, as ours.
+a residual stream of 32 bits; compiled with torch.compile. Arguments that this program does not know, such as
+`--sizes paper`, go to `freerange bench`. Times are medians of calls that were waited for, as ours.
 """
 import argparse
 import json
@@ -193,12 +194,11 @@ def main():
     parser.add_argument("--torch-device", help="the same device for PyTorch [default: the same name]")
     parser.add_argument("--seconds", type=float, default=1.0, help="time per line")
     parser.add_argument("--no-compile", action="store_true", help="PyTorch without torch.compile")
-    parser.add_argument("rest", nargs="*", help="further arguments of `freerange bench`, after --")
-    args = parser.parse_args()
+    args, rest = parser.parse_known_args()
     torch.backends.cuda.matmul.allow_tf32 = True  # what a fast run in 32 bits would use
     device = torch.device(args.torch_device or args.device)
     command = [args.binary, "bench", "--device", args.device, "--only", "raster,block", "--seconds", str(args.seconds), "--json"]
-    ours = json.loads(subprocess.run(command + args.rest, check=True, stdout=subprocess.PIPE).stdout)
+    ours = json.loads(subprocess.run(command + rest, check=True, stdout=subprocess.PIPE).stdout)
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor() or platform.machine()
     print(f"device: {ours['device']} ({ours['hardware']}); PyTorch {torch.__version__} on {device} ({name})")
     print(f"program: freerange {ours['version']}, commit {ours['commit']}, compute {ours['compute']}")
