@@ -4,20 +4,21 @@ use std::sync::Arc;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use freerange_camera::{
-    PatchLayout, View,
+    PatchLayout, Similarity, View,
     image_ops::{resize_area, to_f32_rgba},
     plucker,
 };
 use freerange_data::Object;
 use freerange_model::{FreeRange, ModelConfig};
 use freerange_splat::{Normalization, channel};
+use glam::DVec3;
 use rand::{Rng, SeedableRng, seq::SliceRandom};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
 use crate::{
     FlowError,
-    config::{LossConfig, Stage},
+    config::{FrameJitter, LossConfig, Stage},
     photometric::{Images, Targets},
 };
 
@@ -127,23 +128,31 @@ impl Batch {
         let (mut seen, mut held) = (Vec::new(), Vec::new());
         for object in objects {
             let slice = object.slice(stage.depth)?;
-            let clean = match loss.random_patches {
-                true => normalization.normalize(&slice.shuffled(rng)),
-                false => normalization.normalize(slice),
+            let mut slice = match loss.random_patches {
+                true => slice.shuffled(rng),
+                false => slice.clone(),
             };
-            let mut start: Vec<f32> = (0..clean.len()).map(|_| StandardNormal.sample(rng)).collect();
-            loss.coupling.pair(&mut start, &clean);
-            data.extend(clean);
-            noise.extend(start);
+            let mut start: Vec<f32> = (0..n * channel::COUNT).map(|_| StandardNormal.sample(rng)).collect();
             t.push(loss.time.time(rng.random()));
             conditional.push(if rng.random::<f32>() < loss.unconditional { 0.0 } else { 1.0 });
             backgrounds.push(draw_background(rng));
             let (chosen, rest) = choose_views(&object.views, inputs, one_sided, rng);
-            seen.push(chosen);
-            held.push(rest.into_iter().take(loss.held_views).collect::<Vec<_>>());
+
+            let frame = draw_frame(loss.frame_jitter, rng);
+            if frame != Similarity::IDENTITY {
+                slice.transform(frame.scale, frame.rotation, frame.translation);
+            }
+            let moved =
+                |v: &View| View { camera: v.camera.transformed(&frame), name: v.name.clone(), image: v.image.clone() };
+            seen.push(chosen.into_iter().map(moved).collect::<Vec<_>>());
+            held.push(rest.into_iter().take(loss.held_views).map(moved).collect::<Vec<_>>());
+            let clean = normalization.normalize(&slice);
+            loss.coupling.pair(&mut start, &clean);
+            data.extend(clean);
+            noise.extend(start);
         }
 
-        let at = |views: &[Vec<&View>], size: u32| {
+        let at = |views: &[Vec<View>], size: u32| {
             let small: Vec<Vec<View>> = views.iter().map(|o| o.iter().map(|v| shrink(v, size)).collect()).collect();
             let small: Vec<Vec<&View>> = small.iter().map(|o| o.iter().collect()).collect();
             Ok::<_, FlowError>(Images::new(&small, device)?.on(&backgrounds))
@@ -154,12 +163,30 @@ impl Batch {
             noise: Tensor::from_data(TensorData::new(noise, shape), device),
             t,
             conditional: Tensor::from_data(TensorData::new(conditional, [b, 1, 1]), device),
-            conditioning: Conditioning::new(&seen, model, device)?,
+            conditioning: Conditioning::new(
+                &seen.iter().map(|o| o.iter().collect()).collect::<Vec<_>>(),
+                model,
+                device,
+            )?,
             hint: at(&seen, loss.gradient_size)?,
             seen: at(&seen, loss.render_size)?,
             held: if loss.held_views > 0 { Some(at(&held, loss.render_size)?) } else { None },
         })
     }
+}
+
+/// How far an object's frame is off, for one step.
+fn draw_frame(jitter: FrameJitter, rng: &mut ChaCha8Rng) -> Similarity {
+    let mut draw = |deviation: f32| match deviation > 0.0 {
+        true => {
+            let deviations: f64 = StandardNormal.sample(rng);
+            f64::from(deviation) * deviations.clamp(-2.0, 2.0)
+        }
+        false => 0.0,
+    };
+    let scale = draw(jitter.scale).exp();
+    let translation = DVec3::from_array(std::array::from_fn(|_| draw(jitter.center)));
+    Similarity { scale, translation, ..Similarity::IDENTITY }
 }
 
 /// Splits views into `count` inputs and the rest, both in random order. One-sided: the inputs are those nearest in

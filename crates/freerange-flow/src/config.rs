@@ -116,6 +116,19 @@ pub struct LossConfig {
     pub input_views: (usize, usize),
     /// Share of the batches whose input views all lie on one side of the object.
     pub one_sided: f32,
+    /// How far the frame that an object is shown in is off its own. A user's frame is estimated from few views.
+    pub frame_jitter: FrameJitter,
+}
+
+/// Standard deviations of the normal distributions that a training object's frame is moved by; 0: not at all.
+/// Beyond two of them there is nothing.
+#[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct FrameJitter {
+    /// Of the logarithm of the factor on all lengths.
+    pub scale: f32,
+    /// Of each coordinate of the centre (the object's sphere has radius 0.5).
+    pub center: f32,
 }
 
 impl Default for LossConfig {
@@ -134,6 +147,7 @@ impl Default for LossConfig {
             random_patches: false,
             input_views: (4, 4),
             one_sided: 0.0,
+            frame_jitter: FrameJitter::default(),
         }
     }
 }
@@ -302,6 +316,11 @@ impl TrainConfig {
         )?;
         check((0.0..=1.0).contains(&l.unconditional), "loss.unconditional", "0 to 1", l.unconditional.to_string())?;
         check((0.0..=1.0).contains(&l.one_sided), "loss.one_sided", "0 to 1", l.one_sided.to_string())?;
+        for (field, value) in
+            [("loss.frame_jitter.scale", l.frame_jitter.scale), ("loss.frame_jitter.center", l.frame_jitter.center)]
+        {
+            check((0.0..=0.2).contains(&value), field, "0 to 0.2", value.to_string())?;
+        }
         check(
             (0.0..1.0).contains(&l.min_remaining),
             "loss.min_remaining",

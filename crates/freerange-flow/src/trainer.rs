@@ -62,6 +62,16 @@ struct Progress {
     normalization: Normalization,
 }
 
+/// Weights that a new run starts from.
+#[derive(Clone, Copy, Debug)]
+pub struct Initial<'a> {
+    /// The weights, of the same architecture.
+    pub checkpoint: &'a Checkpoint,
+    /// Normalise Gaussians by the statistics of the run's own data, not by the checkpoint's: for data that
+    /// are made in another way, such as fits instead of points on the surface.
+    pub remeasure: bool,
+}
+
 /// A training run in memory.
 pub struct Trainer {
     config: TrainConfig,
@@ -80,20 +90,18 @@ pub struct Trainer {
 impl Trainer {
     /// Starts a run in `folder`, or goes on with the one that is there.
     ///
-    /// `initial`: weights to start a new run from (fine-tuning); ignored by a run that goes on.
+    /// `initial`: weights to start a new run from; ignored by a run that goes on.
     pub fn open(
         config: TrainConfig,
         folder: &Path,
-        initial: Option<&Checkpoint>,
+        initial: Option<Initial>,
         device: &Device,
         mut progress: impl FnMut(&str),
     ) -> Result<Self, FlowError> {
         config.validate()?;
-        if let Some(checkpoint) = initial {
+        if let Some(Initial { checkpoint, .. }) = initial {
             require_same_model(&config.model, &checkpoint.config)?;
         }
-        std::fs::create_dir_all(folder).map_err(|source| FlowError::Io { path: folder.into(), source })?;
-        check_same_run(&config, folder)?;
         let plain = device.clone().inner();
         let source: Arc<dyn ObjectSource> = match &config.data.shards {
             Some(place) => Arc::new(Shards::open(&Store::open(place)?, &config.depths(), Some(Split::Train))?),
@@ -103,6 +111,9 @@ impl Trainer {
                 seed: config.seed.wrapping_mul(1 << 32),
             }),
         };
+        // Not before the data are there: a folder that holds a configuration belongs to a run.
+        std::fs::create_dir_all(folder).map_err(|source| FlowError::Io { path: folder.into(), source })?;
+        check_same_run(&config, folder)?;
         let tracked = plain.clone().autodiff();
         let mut model = FreeRange::new(&config.model, &mut step_rng(config.seed, u64::MAX), &tracked)?
             .with_compute(config.optimizer.compute)
@@ -136,13 +147,13 @@ impl Trainer {
             }
             None => {
                 let mut square = [0.0; channel::COUNT];
+                if let Some(Initial { checkpoint, .. }) = initial {
+                    model = Weights::of(&checkpoint.model).apply(model);
+                    square = checkpoint.gradient_rms.map(|x| x * x);
+                }
                 let normalization = match initial {
-                    Some(checkpoint) => {
-                        model = Weights::of(&checkpoint.model).apply(model);
-                        square = checkpoint.gradient_rms.map(|x| x * x);
-                        checkpoint.normalization.clone()
-                    }
-                    None => {
+                    Some(Initial { checkpoint, remeasure: false }) => checkpoint.normalization.clone(),
+                    _ => {
                         let count = config.data.statistics_objects as u64;
                         let depth = config.stages.last().map_or(0, |s| s.depth);
                         match source.statistics(depth) {

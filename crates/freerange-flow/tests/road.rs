@@ -1,13 +1,21 @@
 //! The whole road on one object: train, save, load, sample, render. The guard against silent breakage.
 
+use std::sync::Arc;
+
 use burn::tensor::Device;
 use freerange_camera::{View, image_ops::composite};
 use freerange_data::{Generated, ObjectSource};
-use freerange_flow::{config::TrainConfig, sample::reconstruct, trainer::Trainer};
+use freerange_flow::{
+    batch::{Batch, step_rng},
+    config::{FrameJitter, TrainConfig},
+    photometric::{Photometric, Targets},
+    sample::reconstruct,
+    trainer::{Initial, Trainer},
+};
 use freerange_metrics::psnr;
 use freerange_model::Checkpoint;
 use freerange_raster::{RasterConfig, render};
-use freerange_splat::Cloud;
+use freerange_splat::{Cloud, Normalization, channel};
 
 /// A model that learns one object in about a minute.
 const ONE_OBJECT: &str = r#"
@@ -174,6 +182,64 @@ fn an_initial_checkpoint_of_another_architecture_is_refused() {
     let checkpoint = Checkpoint::load(&first.path().join("checkpoint.safetensors"), &device).unwrap();
     let mut other = config(1);
     other.model.hidden = 32;
-    let e = Trainer::open(other, second.path(), Some(&checkpoint), &device, |_| {}).err().expect("refused").to_string();
+    let initial = Initial { checkpoint: &checkpoint, remeasure: false };
+    let e = Trainer::open(other, second.path(), Some(initial), &device, |_| {}).err().expect("refused").to_string();
     assert!(e.contains("architecture"), "{e}");
+    assert_eq!(second.path().read_dir().unwrap().count(), 0, "nothing is written for a run that cannot start");
+}
+
+#[test]
+fn an_initial_checkpoint_gives_its_statistics_unless_they_are_to_be_measured() {
+    let (first, second, third) =
+        (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    train(&config(1), first.path(), 1);
+    let device = Device::flex();
+    let load =
+        |folder: &tempfile::TempDir| Checkpoint::load(&folder.path().join("checkpoint.safetensors"), &device).unwrap();
+    let checkpoint = load(&first);
+    let mut other = config(1);
+    other.data.object.surface.opacity = 0.5;
+    for (folder, remeasure) in [(&second, false), (&third, true)] {
+        let initial = Initial { checkpoint: &checkpoint, remeasure };
+        Trainer::open(other.clone(), folder.path(), Some(initial), &device, |_| {}).unwrap().save().unwrap();
+    }
+    assert_eq!(load(&second).normalization, checkpoint.normalization);
+    let (old, new) = (checkpoint.normalization.mean, load(&third).normalization.mean);
+    assert!(old[channel::LOGIT_OPACITY] > new[channel::LOGIT_OPACITY] + 1.0, "{old:?} {new:?}");
+}
+
+#[test]
+fn a_moved_frame_changes_nothing_that_is_seen() {
+    let still = config(1);
+    let mut moved = still.clone();
+    moved.loss.frame_jitter = FrameJitter { scale: 0.1, center: 0.1 };
+    let device = Device::flex();
+    let source = Generated { config: still.data.object.clone(), depths: vec![6], seed: 5 };
+    let object = Arc::new(source.object(0).unwrap());
+    let normalization = Normalization { mean: [0.0; channel::COUNT], std: [1.0; channel::COUNT] };
+    let photometric = Photometric::new(&normalization, &device);
+    let draw = |config: &TrainConfig, seed: u64| {
+        let mut rng = step_rng(seed, 0);
+        let objects = [object.clone()];
+        Batch::draw(&objects, &config.stages[0], &config.model, &config.loss, &normalization, &mut rng, &device)
+            .unwrap()
+    };
+    let mut shifts = Vec::new();
+    for seed in 0..4 {
+        let (a, b) = (draw(&still, seed), draw(&moved, seed));
+        let rows = |batch: &Batch| batch.data.clone().into_data().try_to_vec::<f32>().unwrap();
+        let (rows_a, rows_b) = (rows(&a), rows(&b));
+        shifts.push(rows_b[channel::LOG_SCALE.start] - rows_a[channel::LOG_SCALE.start]);
+        let loss = |batch: &Batch, targets: &Targets| {
+            photometric.l1(batch.data.clone(), targets).unwrap().into_data().try_to_vec::<f32>().unwrap()[0]
+        };
+        for (x, y) in [(&a.seen, &b.seen), (&a.hint, &b.hint), (a.held.as_ref().unwrap(), b.held.as_ref().unwrap())] {
+            let (x, y) = (loss(&a, x), loss(&b, y));
+            assert!((x - y).abs() < 1e-3 * x, "seed {seed}: {x} {y}");
+        }
+        // The frame is another one all the same.
+        assert!(loss(&a, &b.seen) > 1.1 * loss(&a, &a.seen), "seed {seed}");
+    }
+    assert!(shifts.iter().all(|s| s.abs() > 1e-4 && s.abs() <= 0.2 + 1e-5), "{shifts:?}");
+    assert!(shifts.iter().any(|s| (s - shifts[0]).abs() > 1e-3), "each draw is another one: {shifts:?}");
 }

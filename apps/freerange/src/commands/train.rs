@@ -2,7 +2,10 @@
 
 use std::{io::Write, path::PathBuf, time::Instant};
 
-use freerange_flow::{config::TrainConfig, trainer::Trainer};
+use freerange_flow::{
+    config::TrainConfig,
+    trainer::{Initial, Trainer},
+};
 
 use crate::{
     device::{DeviceName, require},
@@ -24,6 +27,9 @@ pub struct Args {
     /// Checkpoint whose weights a new run starts from.
     #[arg(long, value_name = "FILE")]
     initial: Option<PathBuf>,
+    /// With --initial: normalise by the statistics of this run's data instead of the checkpoint's, for data made otherwise.
+    #[arg(long, requires = "initial")]
+    remeasure: bool,
     /// Stop after so many minutes (the state is saved).
     #[arg(long)]
     minutes: Option<f64>,
@@ -43,7 +49,8 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     require(config.optimizer.compute, &device)?;
     let total = config.total_steps();
     let initial = args.initial.as_deref().map(|path| checkpoint(Some(path), &device)).transpose()?;
-    let mut trainer = Trainer::open(config, &args.output, initial.as_ref(), &device, |m| eprintln!("{m}"))?;
+    let initial = initial.as_ref().map(|checkpoint| Initial { checkpoint, remeasure: args.remeasure });
+    let mut trainer = Trainer::open(config, &args.output, initial, &device, |m| eprintln!("{m}"))?;
     let path = args.output.join("log.jsonl");
     let log = std::fs::File::options().create(true).append(true).open(&path);
     let mut log = std::io::BufWriter::new(log.map_err(|e| CliError::file(&path, e))?);

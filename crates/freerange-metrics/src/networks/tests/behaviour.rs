@@ -9,7 +9,7 @@ use burn::tensor::{Tensor, TensorData};
 use super::{Random, device, golden};
 use crate::{
     Evaluator, EvaluatorConfig, FeatureStatistics, Metric, MetricsError, Pair, frechet_distance,
-    networks::{Inception, Lpips, LpipsNet, host, inception_features, resize::Image8},
+    networks::{Inception, Lpips, LpipsNet, cosine_similarity, host, inception_features, resize::Image8},
     psnr, ssim_3dgs,
     weights::Weights,
 };
@@ -117,11 +117,27 @@ fn fid_grows_with_the_change() {
     let scale: f64 = reference.mean().iter().map(|m| m * m).sum();
     assert!(distance(&truths).abs() < 1e-9 * scale, "{}", distance(&truths));
     let both: Vec<_> = truths.iter().map(|truth| changes(truth)).collect();
-    for kind in 0..2 {
+    for kind in 0..3 {
         let weak: Vec<Vec<f32>> = both.iter().map(|c| c[kind].1.clone()).collect();
         let strong: Vec<Vec<f32>> = both.iter().map(|c| c[kind].2.clone()).collect();
         let (weak, strong) = (distance(&weak), distance(&strong));
         assert!(0.0 < weak && weak < strong, "{}: {weak}, {strong}", both[0][kind].0);
+    }
+}
+
+#[test]
+fn dreamsim_grows_with_the_change() {
+    let folder = golden("networks");
+    for (label, branches) in [("dino", 1), ("ensemble", 3)] {
+        let network = super::dreamsim::load(&folder, &folder.join(format!("{label}_lora")), branches).unwrap();
+        let truth = picture(0.0);
+        let embed = |image: &[f32]| network.embed(&[Image8::quantised(image, SIDE, SIDE)]).remove(0);
+        let distance = |image: &[f32]| 1.0 - cosine_similarity(&embed(image), &embed(&truth));
+        assert!(distance(&truth).abs() < 1e-10, "{label}: {}", distance(&truth));
+        for (name, weak, strong) in changes(&truth) {
+            let (weak, strong) = (distance(&weak), distance(&strong));
+            assert!(0.0 < weak && weak < strong, "{label} {name}: {weak}, {strong}");
+        }
     }
 }
 

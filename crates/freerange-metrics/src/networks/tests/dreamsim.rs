@@ -10,7 +10,7 @@ use crate::{
     },
 };
 
-fn load(folder: &Path, adapter: &Path, branches: usize) -> Result<DreamSim, MetricsError> {
+pub(super) fn load(folder: &Path, adapter: &Path, branches: usize) -> Result<DreamSim, MetricsError> {
     let shape = &json(golden("networks/dreamsim.json"))["shape"];
     let n = |name: &str| shape[name].as_u64().unwrap() as usize;
     let (width, depth, heads, patch, side) = (n("width"), n("depth"), n("heads"), n("patch"), n("side"));
