@@ -1,12 +1,15 @@
-//! Pictures of Gaussians: single views, comparisons, turntables.
+//! Pictures of Gaussians: single views, turntables.
 
 use std::path::Path;
 
-use freerange_camera::{Camera, image_ops::composite};
+use freerange_camera::{
+    Camera,
+    image_ops::{composite, to_picture},
+};
 use freerange_raster::{RasterConfig, render};
 use freerange_splat::Cloud;
 use glam::DVec3;
-use image::{Delay, Frame, Rgba, RgbaImage, codecs::gif};
+use image::{Delay, Frame, RgbaImage, codecs::gif};
 
 use crate::error::CliError;
 
@@ -18,35 +21,9 @@ pub fn render_view(cloud: &Cloud, camera: &Camera) -> Result<Vec<f32>, CliError>
     Ok(render(cloud.rows(), &[*camera], &[WHITE], &RasterConfig::default())?.rgb)
 }
 
-/// 8-bit picture of `[h, w, 3]` values.
-pub fn to_picture(rgb: &[f32], width: u32, height: u32) -> RgbaImage {
-    let byte = |x: f32| (x.clamp(0.0, 1.0) * 255.0).round() as u8;
-    RgbaImage::from_fn(width, height, |x, y| {
-        let i = ((y * width + x) * 3) as usize;
-        Rgba([byte(rgb[i]), byte(rgb[i + 1]), byte(rgb[i + 2]), 255])
-    })
-}
-
 /// An image composited on white.
 pub fn on_white(image: &RgbaImage) -> RgbaImage {
     to_picture(&composite(image, WHITE), image.width(), image.height())
-}
-
-/// Pictures in rows; all pictures of one column should have the same width.
-pub fn grid(rows: &[Vec<RgbaImage>]) -> RgbaImage {
-    let width = rows.iter().map(|r| r.iter().map(|p| p.width()).sum::<u32>()).max().unwrap_or(1).max(1);
-    let heights: Vec<u32> = rows.iter().map(|r| r.iter().map(|p| p.height()).max().unwrap_or(0)).collect();
-    let mut sheet = RgbaImage::from_pixel(width, heights.iter().sum::<u32>().max(1), Rgba([255; 4]));
-    let mut y = 0;
-    for (row, height) in rows.iter().zip(heights) {
-        let mut x = 0;
-        for picture in row {
-            image::imageops::replace(&mut sheet, picture, x, y);
-            x += i64::from(picture.width());
-        }
-        y += i64::from(height);
-    }
-    sheet
 }
 
 /// Writes an animated GIF of the cloud, which is in the canonical frame, turning once about the z axis.

@@ -1,9 +1,9 @@
-//! Small operations on RGBA images: composite, resize, convert.
+//! Small operations on RGBA images: composite, resize, convert, put side by side.
 //!
 //! Images store straight alpha. Whatever mixes pixels mixes them premultiplied, so that the colour of transparent
 //! pixels never bleeds into the result.
 
-use image::RgbaImage;
+use image::{Rgba, RgbaImage};
 
 const TO_UNIT: f32 = 1.0 / 255.0;
 
@@ -22,6 +22,36 @@ pub fn composite(image: &RgbaImage, background: [f32; 3]) -> Vec<f32> {
 /// The image's values in `[0, 1]`, straight alpha: `[h, w, 4]`.
 pub fn to_f32_rgba(image: &RgbaImage) -> Vec<f32> {
     image.as_raw().iter().map(|&v| f32::from(v) * TO_UNIT).collect()
+}
+
+/// The opaque picture of `rgb` (`[h, w, 3]`), clamped to `[0, 1]` and rounded to 8 bits.
+///
+/// # Panics
+/// If there are fewer values.
+pub fn to_picture(rgb: &[f32], width: u32, height: u32) -> RgbaImage {
+    let pixels = rgb.as_chunks::<3>().0;
+    RgbaImage::from_fn(width, height, |x, y| {
+        let [r, g, b] =
+            pixels[y as usize * width as usize + x as usize].map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8);
+        Rgba([r, g, b, 255])
+    })
+}
+
+/// Pictures in rows on a white sheet, which shows where they are transparent.
+pub fn sheet(rows: &[Vec<RgbaImage>]) -> RgbaImage {
+    let width = rows.iter().map(|r| r.iter().map(|p| p.width()).sum::<u32>()).max().unwrap_or(1).max(1);
+    let heights: Vec<u32> = rows.iter().map(|r| r.iter().map(|p| p.height()).max().unwrap_or(0)).collect();
+    let mut sheet = RgbaImage::from_pixel(width, heights.iter().sum::<u32>().max(1), Rgba([255; 4]));
+    let mut y = 0;
+    for (row, height) in rows.iter().zip(heights) {
+        let mut x = 0;
+        for picture in row {
+            image::imageops::overlay(&mut sheet, picture, x, y);
+            x += i64::from(picture.width());
+        }
+        y += i64::from(height);
+    }
+    sheet
 }
 
 /// One output sample along an axis: the first input sample it takes, and the weights of those from there on.

@@ -1,6 +1,6 @@
 //! Image helpers against their slow, obvious twins.
 
-use freerange_camera::image_ops::{composite, resize_area, to_f32_rgba};
+use freerange_camera::image_ops::{composite, resize_area, sheet, to_f32_rgba, to_picture};
 use image::{Rgba, RgbaImage};
 use proptest::prelude::*;
 
@@ -90,4 +90,19 @@ fn a_linear_ramp_grows_linearly() {
 fn empty_sizes_give_empty_images() {
     assert_eq!(resize_area(&RgbaImage::new(3, 3), 0, 2).dimensions(), (0, 2));
     assert_eq!(resize_area(&RgbaImage::new(0, 0), 2, 2), RgbaImage::new(2, 2));
+}
+
+#[test]
+fn pictures_round_clamp_and_stand_in_rows() {
+    let picture = to_picture(&[-1.0, 0.5, 2.0, 0.0, 0.25, 1.0], 2, 1);
+    assert_eq!(picture.as_raw()[..], [0, 128, 255, 255, 0, 64, 255, 255]);
+    let clear = RgbaImage::from_pixel(1, 2, Rgba([9, 9, 9, 0]));
+    let two = sheet(&[vec![picture.clone(), clear], vec![picture.clone()]]);
+    assert_eq!(two.dimensions(), (3, 3));
+    assert_eq!((two.get_pixel(1, 0), two.get_pixel(1, 2)), (picture.get_pixel(1, 0), picture.get_pixel(1, 0)));
+    // White where nothing is or what is there is transparent.
+    for (x, y) in [(2, 0), (2, 1), (0, 1), (2, 2)] {
+        assert_eq!(two.get_pixel(x, y), &Rgba([255; 4]), "{x} {y}");
+    }
+    assert_eq!(sheet(&[]).dimensions(), (1, 1));
 }

@@ -2,9 +2,9 @@
 
 use freerange_camera::{
     View,
-    image_ops::{composite, resize_area},
+    image_ops::{composite, resize_area, sheet, to_picture},
 };
-use image::{Rgba, RgbaImage, codecs::jpeg::JpegEncoder};
+use image::{RgbaImage, codecs::jpeg::JpegEncoder};
 
 use crate::EvalError;
 
@@ -29,23 +29,11 @@ pub fn strip(inputs: &[View], validation: &[View], renders: &[Vec<f32>]) -> Resu
         let (w, h) = truth.dimensions();
         let error = error_map(&renders[i], &composite(truth, WHITE));
         rows[1].push(small(truth));
-        rows[2].push(small(&picture(&renders[i], w, h)));
-        rows[3].push(small(&picture(&error, w, h)));
-    }
-    let width = rows.iter().map(|r| r.iter().map(|p| p.width()).sum::<u32>()).max().unwrap_or(0).max(1);
-    let heights: Vec<u32> = rows.iter().map(|r| r.iter().map(|p| p.height()).max().unwrap_or(0)).collect();
-    let mut sheet = RgbaImage::from_pixel(width, heights.iter().sum::<u32>().max(1), Rgba([255; 4]));
-    let mut y = 0;
-    for (row, height) in rows.iter().zip(heights) {
-        let mut x = 0;
-        for picture in row {
-            image::imageops::overlay(&mut sheet, picture, x, y);
-            x += i64::from(picture.width());
-        }
-        y += i64::from(height);
+        rows[2].push(small(&to_picture(&renders[i], w, h)));
+        rows[3].push(small(&to_picture(&error, w, h)));
     }
     let mut bytes = Vec::new();
-    let sheet = image::DynamicImage::ImageRgba8(sheet).into_rgb8();
+    let sheet = image::DynamicImage::ImageRgba8(sheet(&rows)).into_rgb8();
     sheet.write_with_encoder(JpegEncoder::new_with_quality(&mut bytes, QUALITY))?;
     Ok(bytes)
 }
@@ -58,14 +46,6 @@ fn small(image: &RgbaImage) -> RgbaImage {
     }
     let scaled = |v: u32| (f64::from(v) * f64::from(SIDE) / f64::from(longest)).round().max(1.0) as u32;
     resize_area(image, scaled(image.width()), scaled(image.height()))
-}
-
-fn picture(rgb: &[f32], width: u32, height: u32) -> RgbaImage {
-    let pixels = rgb.as_chunks::<3>().0;
-    RgbaImage::from_fn(width, height, |x, y| {
-        let [r, g, b] = pixels[(y * width + x) as usize].map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8);
-        Rgba([r, g, b, 255])
-    })
 }
 
 /// White at 0, red at a quarter, black at a half and beyond.
@@ -84,6 +64,7 @@ fn error_map(render: &[f32], truth: &[f32]) -> Vec<f32> {
 mod tests {
     use freerange_camera::Camera;
     use glam::DVec3;
+    use image::Rgba;
 
     use super::*;
 

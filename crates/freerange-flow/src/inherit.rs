@@ -154,6 +154,14 @@ mod tests {
     }
 
     #[test]
+    fn the_second_run_of_the_shipped_checkpoint_keeps_its_architecture() {
+        let path = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/tiny_fitted.toml"));
+        let (first, second) = (TrainConfig::load(Path::new("tiny")).unwrap(), TrainConfig::load(path).unwrap());
+        assert_eq!(first.model, second.model);
+        assert!(second.data.shards.is_some());
+    }
+
+    #[test]
     fn every_ablation_differs_from_its_parent_in_one_field() {
         let folder = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/ablations"));
         let mut count = 0;

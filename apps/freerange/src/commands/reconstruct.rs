@@ -3,7 +3,10 @@
 use std::{path::PathBuf, time::Instant};
 
 use burn::tensor::Device;
-use freerange_camera::{Scene, Up, View};
+use freerange_camera::{
+    Scene, Up, View,
+    image_ops::{sheet, to_picture},
+};
 use freerange_flow::sample::{SampleConfig, Solver};
 use freerange_model::Compute;
 use freerange_splat::write_ply;
@@ -13,7 +16,7 @@ use crate::{
     device::{DeviceName, parse_compute, require},
     error::CliError,
     output::OutputFolder,
-    pictures::{grid, on_white, render_view, to_picture, write_turntable},
+    pictures::{on_white, render_view, write_turntable},
     pipeline::{self, Options, Scores, score, to_user},
     runtime::{checkpoint, peak_memory},
 };
@@ -244,7 +247,7 @@ fn comparisons(cloud: &freerange_splat::Cloud, views: &[View]) -> Result<Vec<(St
             let render = to_picture(&render_view(cloud, &view.camera)?, w, h);
             // A view's name may hold folders: keep its last part.
             let name = view.name.rsplit(['/', '\\']).next().unwrap_or("view").to_owned();
-            Ok((name, grid(&[vec![on_white(&view.image), render]])))
+            Ok((name, sheet(&[vec![on_white(&view.image), render]])))
         })
         .collect()
 }

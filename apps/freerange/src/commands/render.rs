@@ -2,15 +2,10 @@
 
 use std::path::PathBuf;
 
-use freerange_camera::load_cameras;
+use freerange_camera::{image_ops::to_picture, load_cameras};
 use freerange_splat::{PlyFile, read_ply};
 
-use crate::{
-    error::CliError,
-    output::OutputFolder,
-    pictures::{render_view, to_picture},
-    progress::Progress,
-};
+use crate::{error::CliError, output::OutputFolder, pictures::render_view, progress::Progress};
 
 /// Render a .ply of Gaussians from given cameras: one PNG per frame, on white.
 #[derive(clap::Args)]
