@@ -253,3 +253,26 @@ fn a_full_disk() {
     assert!(message.contains("gaussians.ply") && message.contains("large"), "{message}");
     assert_eq!(fs::read_dir(place.path()).unwrap().count(), 0, "something was left behind");
 }
+
+#[test]
+fn a_checkpoint_can_be_told_how_to_sample() {
+    let folder = tempfile::tempdir().unwrap();
+    let (config, output) = (folder.path().join("other.toml"), folder.path().join("other.safetensors"));
+    let shipped = root().join("checkpoints/tiny.safetensors");
+    std::fs::write(&config, "parent = \"tiny\"\nsample.steps = 7\n").unwrap();
+    let [shipped, config, output] = [&shipped, &config, &output].map(|p| p.to_str().unwrap());
+    let done = freerange(&["model", "shrink", shipped, output, "--sampling", config]);
+    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    let read = |path: &str| {
+        let bytes = std::fs::read(path).unwrap();
+        let length = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+        let header: serde_json::Value = serde_json::from_slice(&bytes[8..8 + length]).unwrap();
+        let provenance = header["__metadata__"]["provenance"].as_str().unwrap();
+        (serde_json::from_str::<serde_json::Value>(provenance).unwrap(), bytes[8 + length..].to_vec())
+    };
+    let ((mut old, weights), (mut new, same_weights)) = (read(shipped), read(output));
+    assert_eq!(new["sample"]["steps"], 7);
+    assert_ne!(old["sample"]["steps"], 7);
+    [&mut old, &mut new].map(|p| p["sample"].take());
+    assert!(old == new && weights == same_weights, "nothing else changes");
+}

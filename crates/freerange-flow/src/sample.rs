@@ -29,11 +29,16 @@ pub struct SampleConfig {
     pub depth: Option<u32>,
     /// Classifier-free guidance scale s: `z_u + s (z_c - z_u)`. 1 switches it off (and halves the work).
     pub guidance: f32,
-    /// Photometric guidance scale lambda_PG. 0 switches it off.
+    /// Photometric guidance scale lambda_PG. 0 switches it off. What it multiplies is told by `photometric_step`.
     pub photometric: f32,
+    /// The gradient that photometric guidance follows.
+    pub photometric_step: PhotometricStep,
+    /// Side, in pixels, of the renders that photometric guidance compares with the images; left out: `gradient_size`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub photometric_size: Option<u32>,
     /// Where the gradient that the network sees as input is taken.
     pub gradient_at: GradientAt,
-    /// Side, in pixels, of the renders that the photometric gradients are taken on.
+    /// Side, in pixels, of the renders that the gradient for the network is taken on: as in training.
     pub gradient_size: u32,
     /// Colour behind the object in those renders.
     pub background: Background,
@@ -51,6 +56,8 @@ impl Default for SampleConfig {
             depth: None,
             guidance: 2.0,
             photometric: 50.0,
+            photometric_step: PhotometricStep::Gradient,
+            photometric_size: None,
             gradient_at: GradientAt::Noisy,
             gradient_size: 512,
             background: Background::Random,
@@ -78,8 +85,11 @@ impl SampleConfig {
         if !self.photometric.is_finite() || self.photometric < 0.0 {
             return bad("photometric", "a finite number, 0 or more", self.photometric.to_string());
         }
-        if !(8..=4096).contains(&self.gradient_size) {
-            return bad("gradient_size", "8 to 4096 pixels", self.gradient_size.to_string());
+        for (field, size) in [("gradient_size", Some(self.gradient_size)), ("photometric_size", self.photometric_size)]
+        {
+            if let Some(size) = size.filter(|s| !(8..=4096).contains(s)) {
+                return bad(field, "8 to 4096 pixels", size.to_string());
+            }
         }
         Ok(())
     }
@@ -94,6 +104,19 @@ pub enum GradientAt {
     Noisy,
     /// At the network's estimate of the clean sample in the previous step (the noisy sample in the first).
     Estimate,
+}
+
+/// What the photometric guidance takes lambda_PG times.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PhotometricStep {
+    /// The gradient itself, the paper's.
+    #[default]
+    Gradient,
+    /// The gradient as the network sees it: every channel at unit root mean square (measured in training), outliers cut.
+    /// Beyond the paper: gradients of colours are a fifth of those of positions and so hardly move at a lambda at
+    /// which positions are still stable.
+    Scaled,
 }
 
 /// What lies behind the object where renders are compared with images.
@@ -219,10 +242,16 @@ pub fn reconstruct(
 
     let photometric = Photometric::new(&checkpoint.normalization, device);
     let rms = Tensor::<1>::from_floats(checkpoint.gradient_rms, device).reshape([1, 1, channel::COUNT]);
-    let small: Vec<Vec<View>> =
-        objects.iter().map(|o| o.iter().map(|v| shrink(v, config.gradient_size)).collect()).collect();
-    let small: Vec<Vec<&View>> = small.iter().flat_map(|o| vec![o.iter().collect(); seeds.len()]).collect();
-    let images = Images::new(&small, device)?;
+    let at_size = |size: u32| {
+        let small: Vec<Vec<View>> = objects.iter().map(|o| o.iter().map(|v| shrink(v, size)).collect()).collect();
+        let small: Vec<Vec<&View>> = small.iter().flat_map(|o| vec![o.iter().collect(); seeds.len()]).collect();
+        Images::new(&small, device)
+    };
+    let images = at_size(config.gradient_size)?;
+    let guiding = match config.photometric_size {
+        Some(size) if size != config.gradient_size => at_size(size)?,
+        _ => images.clone(),
+    };
     // Everything random about a sample comes from its own seed, whatever else is in the batch.
     let mut noise = Vec::with_capacity(b * n * channel::COUNT);
     let mut backgrounds = vec![Vec::with_capacity(b); config.steps]; // [steps][b]
@@ -233,7 +262,6 @@ pub fn reconstruct(
         noise.extend(one);
         backgrounds.iter_mut().for_each(|step| step.push(config.background.draw(&mut rng)));
     }
-    let targets = |index: usize| images.on(&backgrounds[index]);
     let noise = Tensor::from_data(TensorData::new(noise, [b, n, channel::COUNT]), device);
 
     let mut previous: Option<Tensor<3>> = None;
@@ -246,7 +274,7 @@ pub fn reconstruct(
                     (GradientAt::Estimate, Some(estimate)) => estimate.clone(),
                     _ => step.z.clone(),
                 };
-                Some(scale_gradient(photometric.gradient(at, &targets(step.index))?, &rms))
+                Some(scale_gradient(photometric.gradient(at, &images.on(&backgrounds[step.index]))?, &rms))
             }
         };
         let estimate = if config.guidance == 1.0 {
@@ -267,8 +295,12 @@ pub fn reconstruct(
         if config.photometric == 0.0 {
             return Ok(None);
         }
-        let gradient = photometric.gradient(estimate.clone(), &targets(step.index))?;
-        Ok(Some(gradient.mul_scalar(config.photometric)))
+        let gradient = photometric.gradient(estimate.clone(), &guiding.on(&backgrounds[step.index]))?;
+        let step = match config.photometric_step {
+            PhotometricStep::Gradient => gradient,
+            PhotometricStep::Scaled => scale_gradient(gradient, &rms),
+        };
+        Ok(Some(step.mul_scalar(config.photometric)))
     };
     let estimate = integrate(noise, config.steps, config.solver, estimate, push)?;
 

@@ -42,6 +42,10 @@ pub struct Shrink {
     input: PathBuf,
     /// Checkpoint to write.
     output: PathBuf,
+    /// Sample by default as this configuration's table `sample` says (a file, or tiny, base or paper), not as the one
+    /// that the model was trained with.
+    #[arg(long, value_name = "CONFIG")]
+    sampling: Option<PathBuf>,
 }
 
 /// Runs the command.
@@ -49,7 +53,15 @@ pub fn run(command: &Command) -> Result<(), CliError> {
     match command {
         Command::Info(args) => info(args),
         Command::Shrink(args) => {
-            let checkpoint = runtime::checkpoint(Some(&args.input), &burn::tensor::Device::flex())?;
+            let mut checkpoint = runtime::checkpoint(Some(&args.input), &burn::tensor::Device::flex())?;
+            if let Some(path) = &args.sampling {
+                let sample = serde_json::to_value(TrainConfig::load(path)?.sample).map_err(CliError::input)?;
+                let Some(provenance) = checkpoint.provenance.as_object_mut() else {
+                    let problem = "field `provenance` of the metadata: expected an object";
+                    return Err(CliError::file(&args.input, problem));
+                };
+                provenance.insert("sample".into(), sample);
+            }
             Ok(checkpoint.save_as(&args.output, freerange_model::Precision::F16)?)
         }
     }

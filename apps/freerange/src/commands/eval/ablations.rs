@@ -35,9 +35,9 @@ pub struct Args {
     /// Numbers of steps of the sets `steps` and `solver`.
     #[arg(long, value_delimiter = ',', value_name = "NUMBERS", default_value = "5,10,20,50,100")]
     step_counts: Vec<usize>,
-    /// Photometric guidance scales of the set `lambda`.
-    #[arg(long, value_delimiter = ',', value_name = "NUMBERS", default_value = "10,25,50,100,250,500,1000")]
-    lambdas: Vec<f32>,
+    /// Photometric guidance scales of the set `lambda` [default: a quarter, half, twice and four times the default's].
+    #[arg(long, value_delimiter = ',', value_name = "NUMBERS")]
+    lambdas: Option<Vec<f32>>,
     /// Classifier-free guidance scales of the set `scale`.
     #[arg(long, value_delimiter = ',', value_name = "NUMBERS", default_value = "1.25,1.5,2,3")]
     scales: Vec<f32>,
@@ -80,7 +80,10 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     };
     let values = Values {
         steps: args.step_counts.clone(),
-        lambda: args.lambdas.clone(),
+        lambda: args
+            .lambdas
+            .clone()
+            .unwrap_or_else(|| [0.25, 0.5, 2.0, 4.0].map(|factor| factor * default.sample.photometric).into()),
         scale: args.scales.clone(),
         inputs: args.input_counts.clone(),
         solvers: args.solvers.clone(),
