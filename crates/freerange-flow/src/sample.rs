@@ -119,6 +119,16 @@ pub enum PhotometricStep {
     Scaled,
 }
 
+impl PhotometricStep {
+    /// What lambda_PG multiplies, of a gradient whose channels have the root mean squares `rms`.
+    fn of(self, gradient: Tensor<3>, rms: &Tensor<3>) -> Tensor<3> {
+        match self {
+            Self::Gradient => gradient,
+            Self::Scaled => scale_gradient(gradient, rms),
+        }
+    }
+}
+
 /// What lies behind the object where renders are compared with images.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -296,11 +306,7 @@ pub fn reconstruct(
             return Ok(None);
         }
         let gradient = photometric.gradient(estimate.clone(), &guiding.on(&backgrounds[step.index]))?;
-        let step = match config.photometric_step {
-            PhotometricStep::Gradient => gradient,
-            PhotometricStep::Scaled => scale_gradient(gradient, &rms),
-        };
-        Ok(Some(step.mul_scalar(config.photometric)))
+        Ok(Some(config.photometric_step.of(gradient, &rms).mul_scalar(config.photometric)))
     };
     let estimate = integrate(noise, config.steps, config.solver, estimate, push)?;
 
@@ -331,6 +337,16 @@ mod tests {
     /// known.
     const M: f32 = 0.7;
     const S: f32 = 0.4;
+
+    #[test]
+    fn guidance_follows_the_gradient_or_its_channels_at_one_scale() {
+        let tensor = |values: [f32; 3]| Tensor::<3>::from_data([[values]], &Device::flex());
+        let (gradient, rms) = (tensor([2e-4, -6e-6, 9.0]), tensor([1e-4, 3e-6, 0.1]));
+        let of = |way: PhotometricStep| way.of(gradient.clone(), &rms).into_data().try_to_vec::<f32>().unwrap();
+        assert_eq!(of(PhotometricStep::Gradient), [2e-4, -6e-6, 9.0]);
+        let scaled = of(PhotometricStep::Scaled);
+        assert!(scaled.iter().zip([2.0, -2.0, GRADIENT_LIMIT]).all(|(a, b)| (a - b).abs() < 1e-5), "{scaled:?}");
+    }
 
     fn error(solver: Solver, steps: usize) -> f32 {
         let device = Device::flex();
