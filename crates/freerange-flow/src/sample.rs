@@ -33,6 +33,8 @@ pub struct SampleConfig {
     pub photometric: f32,
     /// The gradient that photometric guidance follows.
     pub photometric_step: PhotometricStep,
+    /// Photometric steps per step of the solver, each at the estimate that the one before has moved. The paper takes one.
+    pub photometric_repeats: usize,
     /// Side, in pixels, of the renders that photometric guidance compares with the images; left out: `gradient_size`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub photometric_size: Option<u32>,
@@ -57,6 +59,7 @@ impl Default for SampleConfig {
             guidance: 2.0,
             photometric: 50.0,
             photometric_step: PhotometricStep::Gradient,
+            photometric_repeats: 1,
             photometric_size: None,
             gradient_at: GradientAt::Noisy,
             gradient_size: 512,
@@ -84,6 +87,9 @@ impl SampleConfig {
         }
         if !self.photometric.is_finite() || self.photometric < 0.0 {
             return bad("photometric", "a finite number, 0 or more", self.photometric.to_string());
+        }
+        if !(1..=1000).contains(&self.photometric_repeats) {
+            return bad("photometric_repeats", "1 to 1000", self.photometric_repeats.to_string());
         }
         for (field, size) in [("gradient_size", Some(self.gradient_size)), ("photometric_size", self.photometric_size)]
         {
@@ -305,8 +311,13 @@ pub fn reconstruct(
         if config.photometric == 0.0 {
             return Ok(None);
         }
-        let gradient = photometric.gradient(estimate.clone(), &guiding.on(&backgrounds[step.index]))?;
-        Ok(Some(config.photometric_step.of(gradient, &rms).mul_scalar(config.photometric)))
+        let targets = guiding.on(&backgrounds[step.index]);
+        let mut moved = estimate.clone();
+        for _ in 0..config.photometric_repeats {
+            let gradient = photometric.gradient(moved.clone(), &targets)?;
+            moved = moved - config.photometric_step.of(gradient, &rms).mul_scalar(config.photometric);
+        }
+        Ok(Some(estimate.clone() - moved))
     };
     let estimate = integrate(noise, config.steps, config.solver, estimate, push)?;
 

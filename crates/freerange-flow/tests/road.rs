@@ -139,19 +139,28 @@ fn one_object_is_learned_sampled_and_rendered() {
 
     // What photometric guidance follows, and on what images, is as configured.
     let ways = [
-        (0.0, PhotometricStep::Gradient, None),
-        (50.0, PhotometricStep::Gradient, None),
-        (0.1, PhotometricStep::Scaled, None),
-        (0.1, PhotometricStep::Scaled, Some(16)),
-        (0.1, PhotometricStep::Scaled, Some(32)),
+        (0.0, PhotometricStep::Gradient, 1, None),
+        (50.0, PhotometricStep::Gradient, 1, None),
+        (0.1, PhotometricStep::Scaled, 1, None),
+        (0.1, PhotometricStep::Scaled, 2, None),
+        (0.1, PhotometricStep::Scaled, 1, Some(16)),
+        (0.1, PhotometricStep::Scaled, 1, Some(32)),
     ];
-    let sampled = ways.map(|(photometric, photometric_step, photometric_size)| {
-        let sample = SampleConfig { photometric, photometric_step, photometric_size, ..config.sample.clone() };
-        reconstruct(&checkpoint, &[inputs], &sample, &[5], &device, |_| {}).unwrap().remove(0).remove(0)
+    let sampled = ways.map(|(photometric, photometric_step, photometric_repeats, photometric_size)| {
+        let guidance = SampleConfig {
+            photometric,
+            photometric_step,
+            photometric_repeats,
+            photometric_size,
+            ..config.sample.clone()
+        };
+        reconstruct(&checkpoint, &[inputs], &guidance, &[5], &device, |_| {}).unwrap().remove(0).remove(0)
     });
-    assert!(sampled[..4].windows(2).all(|w| w[0] != w[1]), "each way is another one");
-    assert_eq!(config.sample.photometric_step, PhotometricStep::Gradient, "the default is the paper's");
-    assert_eq!(sampled[4], sampled[2], "gradient_size is what a left out photometric_size means");
+    for (i, a) in sampled[..5].iter().enumerate() {
+        assert!(sampled[..i].iter().all(|b| a != b), "each way is another one");
+    }
+    assert_eq!((config.sample.photometric_step, config.sample.photometric_repeats), (PhotometricStep::Gradient, 1));
+    assert_eq!(sampled[5], sampled[2], "gradient_size is what a left out photometric_size means");
 
     // Another batch: two objects (the second sees other views), one seed.
     let both = reconstruct(&checkpoint, &[inputs, unseen], &config.sample, &[5], &device, |_| {}).unwrap();
