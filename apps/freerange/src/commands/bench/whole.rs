@@ -33,9 +33,9 @@ pub struct Sample {
     steps: usize,
     /// Encoding the images, once.
     encode_seconds: f64,
-    /// Both branches of the guidance, per step.
+    /// The network, per step: both branches where there is classifier-free guidance.
     transformer_seconds: f64,
-    /// Render, compare, and the gradient; there are two of these per step.
+    /// Render, compare, and the gradient, per step: for the network and for guidance.
     gradient_seconds: f64,
     /// All steps, and what comes before and after.
     whole_seconds: f64,
@@ -50,7 +50,7 @@ impl Sample {
         "steps",
         "encode, ms",
         "transformer, ms/step",
-        "photometric gradient, ms (two per step)",
+        "photometric gradients, ms/step",
         "whole, s",
         "whole, ms/step",
         "of peak",
@@ -118,16 +118,28 @@ pub fn sample(
     let conditioning = Conditioning::new(&seen, &model_config, device)?;
     let encode_seconds = timer.time(|| Ok(conditioning.clone().encode(&model)))?;
     let tokens = conditioning.encode(&model);
-    let both = Tensor::cat(vec![tokens.clone(), tokens.zeros_like()], 0);
+    let branches = if settings.guidance == 1.0 { 1 } else { 2 };
+    let tokens = tokens.repeat_dim(0, branches);
     let normal = |b: usize| Tensor::<3>::random([b, n, 14], Distribution::Normal(0.0, 1.0), device);
-    let (z, hint, t) = (normal(2 * b), normal(2 * b), Tensor::<1>::full([2 * b], 0.5, device));
+    let (z, hint) = (normal(branches * b), normal(branches * b));
+    let t = Tensor::<1>::full([branches * b], 0.5, device);
     let hint = model_config.gradient_channels.then_some(hint);
-    let transformer_seconds = timer.time(|| Ok(model.denoise(z.clone(), hint.clone(), both.clone(), t.clone())))?;
-    let small: Vec<View> = views.iter().map(|v| shrink(v, settings.gradient_size)).collect();
-    let images = Images::new(&vec![small.iter().collect(); b], device)?;
+    let transformer_seconds = timer.time(|| Ok(model.denoise(z.clone(), hint.clone(), tokens.clone(), t.clone())))?;
     let photometric = Photometric::new(&checkpoint.normalization, device);
     let start = normal(b);
-    let gradient_seconds = timer.time(|| Ok(photometric.gradient(start.clone(), &images.on(&vec![[0.5; 3]; b]))?))?;
+    let gradient_at = |size: u32| {
+        let small: Vec<View> = views.iter().map(|v| shrink(v, size)).collect();
+        let images = Images::new(&vec![small.iter().collect(); b], device)?;
+        timer.time(|| Ok(photometric.gradient(start.clone(), &images.on(&vec![[0.5; 3]; b]))?))
+    };
+    let mut gradient_seconds = 0.0;
+    if model_config.gradient_channels {
+        gradient_seconds += gradient_at(settings.gradient_size)?;
+    }
+    if settings.photometric > 0.0 {
+        let size = settings.photometric_size.unwrap_or(settings.gradient_size);
+        gradient_seconds += settings.photometric_repeats as f64 * gradient_at(size)?;
+    }
 
     // The whole, as `reconstruct` does it. One step first: every kernel is compiled by then.
     let run =
@@ -136,8 +148,8 @@ pub fn sample(
     let begin = Instant::now();
     run(steps)?;
     let whole_seconds = begin.elapsed().as_secs_f64();
-    let info = ModelInfo::new(&model_config, Workload { batch: 2 * b, views: VIEWS, gaussians: n });
-    let flops = info.encoder_flops / 2.0 + steps as f64 * info.forward_flops;
+    let info = ModelInfo::new(&model_config, Workload { batch: branches * b, views: VIEWS, gaussians: n });
+    let flops = info.encoder_flops / branches as f64 + steps as f64 * info.forward_flops;
     Ok(Sample {
         size: size.into(),
         objects,
