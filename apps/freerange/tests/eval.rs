@@ -440,6 +440,8 @@ fn ablations_change_one_setting_at_a_time_and_can_be_resumed() {
         "full",
         "--steps",
         "1",
+        "--guidance",
+        "1.5",
         "--sets",
         "guidance,steps,inputs",
         "--step-counts",
