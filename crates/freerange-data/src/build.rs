@@ -542,6 +542,7 @@ where
             gaussians: made.leaves.len() as u64,
             psnr: made.psnr.clone(),
             flagged,
+            input_fits: made.object.input_fits.iter().map(|f| f.views.clone()).collect(),
             evaluation: evaluation(&made.object.views, config, seed).map_err(|e| chain(&e))?,
         };
         let mut statistics = BTreeMap::new();

@@ -4,13 +4,14 @@ use std::collections::BTreeMap;
 use std::time::Instant;
 
 use freerange_camera::{Camera, View};
-use freerange_fit::FitConfig;
+use freerange_fit::{FitConfig, QuickFitConfig};
 use freerange_mesh::{CameraConfig, GeneratorConfig, LightingConfig, Mesh, Scene, generate, orbit_cameras, render};
 use freerange_splat::{Alignment, Cloud, LodTree};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::fitted::{fitted_gaussians, polished};
+use crate::input_fit::{InputFit, input_fits};
 use crate::quality::psnr_over_white;
 use crate::{DataError, SurfaceConfig, surface_gaussians};
 
@@ -37,6 +38,10 @@ pub struct ObjectConfig {
     pub fit: FitConfig,
     /// Gradient steps that adapt each slice of the tree to the views. 0: slices are what the tree says.
     pub polish: usize,
+    /// Quick fits of some of the views, each of a set of its own, as sampling starts from: see [`InputFit`].
+    pub input_fits: usize,
+    /// How these are made.
+    pub quick_fit: QuickFitConfig,
     /// How the axes of the Gaussians in the tree are labelled.
     pub alignment: Alignment,
     /// Rendered views per object.
@@ -58,6 +63,8 @@ impl Default for ObjectConfig {
             surface: SurfaceConfig::default(),
             fit: FitConfig::default(),
             polish: 0,
+            input_fits: 0,
+            quick_fit: QuickFitConfig::default(),
             alignment: Alignment::Identity,
             views: 40,
             samples_per_axis: 2,
@@ -77,6 +84,8 @@ pub struct Object {
     pub views: Vec<View>,
     /// Slices of the level-of-detail tree by depth; depth `l` has `2^l` Gaussians in tree order.
     pub slices: BTreeMap<u32, Cloud>,
+    /// What a few of the views tell without a network.
+    pub input_fits: Vec<InputFit>,
 }
 
 impl Object {
@@ -114,6 +123,8 @@ pub struct Seconds {
     pub fit: f64,
     /// The tree and its slices.
     pub tree: f64,
+    /// Quick fits of some of the views.
+    pub input_fits: f64,
     /// Comparing Gaussians with the views that are held out.
     pub measure: f64,
     /// Encoding and writing.
@@ -122,13 +133,14 @@ pub struct Seconds {
 
 impl Seconds {
     /// Each stage with its name, in order.
-    pub fn stages(&self) -> [(&'static str, f64); 7] {
+    pub fn stages(&self) -> [(&'static str, f64); 8] {
         [
             ("read", self.read),
             ("scene", self.scene),
             ("render", self.render),
             ("fit", self.fit),
             ("tree", self.tree),
+            ("input fits", self.input_fits),
             ("measure", self.measure),
             ("write", self.write),
         ]
@@ -141,8 +153,8 @@ impl Seconds {
 
     /// Stage by stage, `self + factor * other`.
     pub(crate) fn add(&mut self, other: &Self, factor: f64) {
-        let Self { read, scene, render, fit, tree, measure, write } = self;
-        let mine = [read, scene, render, fit, tree, measure, write];
+        let Self { read, scene, render, fit, tree, input_fits, measure, write } = self;
+        let mine = [read, scene, render, fit, tree, input_fits, measure, write];
         mine.into_iter().zip(other.stages()).for_each(|(a, (_, b))| *a += factor * b);
     }
 }
@@ -193,6 +205,10 @@ pub(crate) fn make(
     lap(&mut seconds.tree, start);
 
     let start = Instant::now();
+    let input_fits = input_fits(&shot.views, config, seed)?;
+    lap(&mut seconds.input_fits, start);
+
+    let start = Instant::now();
     let psnr = match shot.held_out.as_slice() {
         [] => None,
         views => {
@@ -202,7 +218,7 @@ pub(crate) fn make(
         }
     };
     lap(&mut seconds.measure, start);
-    Ok(Made { object: Object { id, views: shot.views, slices }, leaves, psnr, seconds })
+    Ok(Made { object: Object { id, views: shot.views, slices, input_fits }, leaves, psnr, seconds })
 }
 
 /// A lit mesh and its views.

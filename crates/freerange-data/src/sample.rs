@@ -4,7 +4,7 @@
 //! |---|---|
 //! | `KEY.json` | [`Metadata`] |
 //! | `KEY.cameras.json` | name, size, intrinsics and pose of every view; see [`CAMERAS`] |
-//! | `KEY.gaussians.safetensors` | `depth_08` f32 `[256, 14]`, ...: the slices, channels as in [`freerange_splat::channel`]; `leaves` f32 `[n, 14]`, where they are kept: the Gaussians before the tree |
+//! | `KEY.gaussians.safetensors` | `depth_08` f32 `[256, 14]`, ...: the slices, channels as in [`freerange_splat::channel`]; `leaves` f32 `[n, 14]`, where they are kept: the Gaussians before the tree; `input_fit_00` f16 `[n, 14]`, ...: quick fits of some of the views |
 //! | `KEY.000.webp`, ... | the views, 8-bit RGBA with straight alpha, in the order of the cameras; or `KEY.000.png`, ... |
 
 use std::collections::BTreeMap;
@@ -14,11 +14,12 @@ use std::path::Path;
 use freerange_camera::{Camera, View, ViewSets};
 use freerange_splat::{Cloud, channel};
 use glam::{DMat3, DMat4, DVec4};
+use half::f16;
 use image::codecs::{png::PngDecoder, webp::WebPDecoder};
 use image::{ColorType, DynamicImage, ImageDecoder, ImageResult, RgbaImage};
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 
-use crate::{DataError, HeldOutPsnr, ImageFormat, Object, Split};
+use crate::{DataError, HeldOutPsnr, ImageFormat, InputFit, Object, Split};
 
 /// Ends of the names of an object's entries but its views.
 pub(crate) const METADATA: &str = "json";
@@ -31,6 +32,8 @@ pub(crate) const MAX_VIEWS: usize = 1000;
 pub(crate) const MAX_SIDE: u32 = 8192;
 /// Pixels that the views of an object may have together: 1 GiB decoded.
 const MAX_PIXELS: u64 = 1 << 28;
+/// Most quick fits of an object.
+pub(crate) const MAX_FITS: usize = 64;
 /// Deepest slice.
 pub(crate) const MAX_DEPTH: u32 = 22;
 
@@ -60,6 +63,9 @@ pub struct Metadata {
     pub psnr: Option<HeldOutPsnr>,
     /// Whether the Gaussians are too bad to train on.
     pub flagged: bool,
+    /// The views that each quick fit saw, by number.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub input_fits: Vec<Vec<usize>>,
     /// The views that evaluation gives to a model, and those that it scores, by number; `None` where there are too few.
     pub evaluation: Option<ViewSets>,
 }
@@ -121,6 +127,10 @@ pub(crate) fn view_entry(i: usize, format: ImageFormat) -> String {
 /// Name of the tensor of the Gaussians before the tree.
 const LEAVES: &str = "leaves";
 
+fn fit_name(i: usize) -> String {
+    format!("input_fit_{i:02}")
+}
+
 fn tensor_name(depth: u32) -> String {
     format!("depth_{depth:02}")
 }
@@ -157,7 +167,7 @@ pub(crate) fn encode(
     let mut entries = vec![
         (METADATA.into(), json(METADATA, serde_json::to_vec_pretty(metadata))?),
         (CAMERAS.into(), json(CAMERAS, serde_json::to_vec(&cameras))?),
-        (GAUSSIANS.into(), encode_gaussians(&object.slices, leaves, place.of(GAUSSIANS))?),
+        (GAUSSIANS.into(), encode_gaussians(object, leaves, place.of(GAUSSIANS))?),
     ];
     for (i, view) in object.views.iter().enumerate() {
         let name = view_entry(i, format);
@@ -181,24 +191,32 @@ pub(crate) fn encode(
     Ok(entries)
 }
 
-fn encode_gaussians(slices: &BTreeMap<u32, Cloud>, leaves: Option<&Cloud>, place: Place) -> Result<Vec<u8>, DataError> {
+fn encode_gaussians(object: &Object, leaves: Option<&Cloud>, place: Place) -> Result<Vec<u8>, DataError> {
     let bytes_of = |cloud: &Cloud| -> Vec<u8> { cloud.rows().iter().flat_map(|v| v.to_le_bytes()).collect() };
-    let mut tensors = Vec::with_capacity(slices.len() + 1);
-    for (&depth, cloud) in slices {
+    let mut tensors = Vec::with_capacity(object.slices.len() + 1);
+    for (&depth, cloud) in &object.slices {
         if depth > MAX_DEPTH || cloud.len() != 1 << depth {
             let expected = format!("2^depth Gaussians at depths up to {MAX_DEPTH}");
             return Err(place.error(expected, format!("{} at depth {depth}", cloud.len())));
         }
         cloud.check_finite()?;
-        tensors.push((tensor_name(depth), cloud.len(), bytes_of(cloud)));
+        tensors.push((tensor_name(depth), Dtype::F32, cloud.len(), bytes_of(cloud)));
     }
     if let Some(leaves) = leaves {
         leaves.check_finite()?;
-        tensors.push((LEAVES.into(), leaves.len(), bytes_of(leaves)));
+        tensors.push((LEAVES.into(), Dtype::F32, leaves.len(), bytes_of(leaves)));
     }
-    let view = |n: usize, bytes| TensorView::new(Dtype::F32, vec![n, channel::COUNT], bytes);
+    for (i, fit) in object.input_fits.iter().enumerate() {
+        let halves: Vec<f16> = fit.gaussians.rows().iter().map(|v| f16::from_f32(*v)).collect();
+        if let Some(bad) = halves.iter().position(|v| !v.is_finite()) {
+            return Err(place.error("quick fits of numbers that 16 bits hold", fit.gaussians.rows()[bad]));
+        }
+        let bytes = halves.iter().flat_map(|v| v.to_le_bytes()).collect();
+        tensors.push((fit_name(i), Dtype::F16, fit.gaussians.len(), bytes));
+    }
+    let view = |dtype, n: usize, bytes| TensorView::new(dtype, vec![n, channel::COUNT], bytes);
     let refused = |e| place.error("tensors safetensors can hold", e);
-    let views = tensors.iter().map(|(name, n, bytes)| Ok((name, view(*n, bytes)?)));
+    let views = tensors.iter().map(|(name, dtype, n, bytes)| Ok((name, view(*dtype, *n, bytes)?)));
     let views = views.collect::<Result<Vec<_>, _>>().map_err(refused)?;
     safetensors::serialize(views, None).map_err(refused)
 }
@@ -324,6 +342,38 @@ pub(crate) fn decode_slices(bytes: &[u8], depths: &[u32], place: Place) -> Resul
 pub(crate) fn decode_leaves(bytes: &[u8], place: Place) -> Result<Option<Cloud>, DataError> {
     let tensors = SafeTensors::deserialize(bytes).map_err(|e| place.error("a safetensors file", e))?;
     tensors.tensor(LEAVES).ok().map(|tensor| cloud(&tensor, LEAVES, None, place)).transpose()
+}
+
+/// Of `KEY.gaussians.safetensors` the quick fits, one for each set of `views`; `count` views has the object.
+pub(crate) fn decode_fits(
+    bytes: &[u8],
+    views: &[Vec<usize>],
+    count: usize,
+    place: Place,
+) -> Result<Vec<InputFit>, DataError> {
+    if views.len() > MAX_FITS {
+        return Err(place.of(METADATA).error(format!("at most {MAX_FITS} input_fits"), views.len()));
+    }
+    let tensors = SafeTensors::deserialize(bytes).map_err(|e| place.error("a safetensors file", e))?;
+    let fit = |(i, views): (usize, &Vec<usize>)| {
+        let fine = !views.is_empty() && views.len() <= count && views.iter().all(|&v| v < count);
+        if !fine {
+            let expected = format!("input_fits of 1 to {count} views, by numbers below {count}");
+            return Err(place.of(METADATA).error(expected, format!("{views:?}")));
+        }
+        let name = fit_name(i);
+        let tensor = tensors.tensor(&name).map_err(|_| place.error(format!("tensor {name}"), "none"))?;
+        let fits = matches!(tensor.shape(), &[n, channel::COUNT] if n.is_power_of_two() && n <= 1 << MAX_DEPTH);
+        if tensor.dtype() != Dtype::F16 || !fits {
+            let found = format!("{:?} {:?}", tensor.dtype(), tensor.shape());
+            return Err(place.error(format!("tensor {name} of F16 [2^n, {}]", channel::COUNT), found));
+        }
+        let values = tensor.data().as_chunks::<2>().0.iter().map(|b| f16::from_le_bytes(*b).to_f32());
+        let gaussians = Cloud::from_rows(values.collect());
+        gaussians.check_finite().map_err(|e| place.error(format!("finite numbers in tensor {name}"), e))?;
+        Ok(InputFit { views: views.clone(), gaussians })
+    };
+    views.iter().enumerate().map(fit).collect()
 }
 
 /// A tensor `[rows, 14]` of finite f32; any number of rows where none is given.

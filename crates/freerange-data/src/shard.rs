@@ -78,13 +78,16 @@ impl Sample {
         let place = Place { shard: path, sample: &self.key, entry: METADATA };
         let cameras = fetch(self.cameras)?;
         let cameras = sample::decode_cameras(&cameras, self.views.len(), place.of(CAMERAS))?;
-        let slices = sample::decode_slices(&fetch(self.gaussians)?, depths, place.of(GAUSSIANS))?;
+        let gaussians = fetch(self.gaussians)?;
+        let slices = sample::decode_slices(&gaussians, depths, place.of(GAUSSIANS))?;
+        let fitted = sample::decode_metadata(&fetch(self.metadata)?, place)?.input_fits;
+        let input_fits = sample::decode_fits(&gaussians, &fitted, self.views.len(), place.of(GAUSSIANS))?;
         let views = cameras.into_iter().zip(&self.views).enumerate().map(|(k, ((name, camera), &span))| {
             let bytes = fetch(span)?;
             let entry = sample::view_entry(k, self.format);
             sample::decode_view(&bytes, self.format, name, camera, place.of(&entry))
         });
-        Ok(Object { id: self.key.to_string(), views: views.collect::<Result<_, _>>()?, slices })
+        Ok(Object { id: self.key.to_string(), views: views.collect::<Result<_, _>>()?, slices, input_fits })
     }
 
     fn metadata(&self, path: &Path, mut fetch: impl Fetch) -> Result<Metadata, DataError> {

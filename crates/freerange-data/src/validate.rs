@@ -1,6 +1,7 @@
 //! Checks of a configuration before anything is made with it.
 
-use crate::sample::{MAX_DEPTH, MAX_SIDE, MAX_VIEWS};
+use crate::input_fit::MIN_VIEWS;
+use crate::sample::{MAX_DEPTH, MAX_FITS, MAX_SIDE, MAX_VIEWS};
 use crate::{DataError, GaussianSource, ObjectConfig};
 
 /// Refuses with the field's name unless `ok`, which is written so that NaN fails it.
@@ -24,6 +25,14 @@ impl ObjectConfig {
         let side = self.cameras.resolution;
         let sides = format!("1 to {MAX_SIDE}");
         check((1..=MAX_SIDE).contains(&side), "object.cameras.resolution", &sides, side)?;
+        check(self.input_fits <= MAX_FITS, "object.input_fits", &format!("0 to {MAX_FITS}"), self.input_fits)?;
+        if self.input_fits > 0 {
+            let expected = format!("at least {MIN_VIEWS} with object.input_fits");
+            check(self.views >= MIN_VIEWS, "object.views", &expected, self.views)?;
+            let count = self.quick_fit.gaussians;
+            check(count.is_power_of_two(), "object.quick_fit.gaussians", "a power of two", count)?;
+            self.quick_fit.check()?;
+        }
         let s = &self.surface;
         let points = 1..=1usize << MAX_DEPTH;
         check(points.contains(&s.points), "object.surface.points", &format!("1 to 2^{MAX_DEPTH}"), s.points)?;

@@ -158,7 +158,12 @@ impl Default for RefineConfig {
 }
 
 /// Refuses with the field's name unless `ok`, which is written so that NaN fails it.
-fn check(field: &'static str, expected: &str, found: impl std::fmt::Display, ok: bool) -> Result<(), FitError> {
+pub(crate) fn check(
+    field: &'static str,
+    expected: &str,
+    found: impl std::fmt::Display,
+    ok: bool,
+) -> Result<(), FitError> {
     if ok { Ok(()) } else { Err(FitError::Config { field, expected: expected.into(), found: found.to_string() }) }
 }
 

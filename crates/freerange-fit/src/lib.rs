@@ -12,6 +12,7 @@ mod fit;
 mod init;
 mod mcmc;
 mod objective;
+mod quick;
 mod refine;
 #[cfg(test)]
 mod tests;
@@ -20,6 +21,7 @@ mod views;
 pub use config::{Background, FitConfig, Rates, RefineConfig};
 pub use error::FitError;
 pub use fit::fit;
+pub use quick::{QuickFitConfig, quick_fit, tree_slice};
 pub use refine::refine;
 
 /// How far [`fit`] or [`refine`] has come.

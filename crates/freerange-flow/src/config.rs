@@ -84,6 +84,8 @@ pub struct BuildOverrides {
     pub views: Option<usize>,
     /// Gradient steps that adapt each slice to the views.
     pub polish: Option<usize>,
+    /// Quick fits of some of the views per object.
+    pub input_fits: Option<usize>,
 }
 
 /// The training loss (paper, Section 3.3).
@@ -271,6 +273,7 @@ impl TrainConfig {
         let mut object = data.object.clone();
         object.views = data.build.views.unwrap_or(object.views);
         object.polish = data.build.polish.unwrap_or(object.polish);
+        object.input_fits = data.build.input_fits.unwrap_or(object.input_fits);
         BuildConfig {
             seed: self.seed,
             depths: if data.depths.is_empty() { self.depths() } else { data.depths.clone() },

@@ -18,8 +18,8 @@ use crate::build::{FileFacts, build_with};
 use crate::object::{Made, generated_id};
 use crate::shard::{END, object_bytes};
 use crate::{
-    BuildConfig, BuildOptions, DataError, HeldOutPsnr, ImageFormat, Item, Items, Metadata, Object, ObjectConfig,
-    Seconds, ShardConfig, Shards, Split, Store, Summary,
+    BuildConfig, BuildOptions, DataError, HeldOutPsnr, ImageFormat, InputFit, Item, Items, Metadata, Object,
+    ObjectConfig, Seconds, ShardConfig, Shards, Split, Store, Summary,
 };
 
 /// Generated objects at their smallest.
@@ -55,7 +55,12 @@ fn toy(seed: u64) -> Object {
     });
     let views = views.collect();
     let mut cloud = |n: usize| Cloud::from_rows((0..n * channel::COUNT).map(|_| rng.random_range(-1.0..1.0)).collect());
-    Object { id: generated_id(seed), views, slices: BTreeMap::from([(2, cloud(4)), (3, cloud(8))]) }
+    let slices = BTreeMap::from([(2, cloud(4)), (3, cloud(8))]);
+    // Numbers that 16 bits hold.
+    let fit = Cloud::from_rows((0..4 * channel::COUNT).map(|_| f32::from(rng.random::<i8>()) / 64.0).collect());
+    let input_fits =
+        vec![InputFit { views: vec![1], gaussians: fit.clone() }, InputFit { views: vec![1, 0], gaussians: fit }];
+    Object { id: generated_id(seed), views, slices, input_fits }
 }
 
 /// A toy as a build makes it. Its fit is as bad as `psnr` says.
@@ -96,6 +101,7 @@ fn metadata_of(object: &Object) -> Metadata {
         gaussians: 8,
         psnr: made(1, 30.0).0.psnr,
         flagged: false,
+        input_fits: object.input_fits.iter().map(|f| f.views.clone()).collect(),
         evaluation: None,
     }
 }

@@ -99,6 +99,9 @@ pub struct Settings {
     /// Gradient steps that adapt each slice to the views; 0: slices are what the tree says.
     #[arg(long)]
     polish: Option<usize>,
+    /// Quick fits of some of the views per object, as sampling starts from.
+    #[arg(long, value_name = "N")]
+    fits: Option<usize>,
     /// Objects per shard.
     #[arg(long)]
     objects_per_shard: Option<u64>,
@@ -135,6 +138,7 @@ impl Settings {
         object.cameras.resolution = self.resolution.unwrap_or(object.cameras.resolution);
         object.fit.iterations = self.iterations.unwrap_or(object.fit.iterations);
         object.polish = self.polish.unwrap_or(object.polish);
+        object.input_fits = self.fits.unwrap_or(object.input_fits);
         config.shard.leaves |= self.keep_leaves;
         config.shard.objects_per_shard = self.objects_per_shard.unwrap_or(config.shard.objects_per_shard);
         config.shard.min_psnr = self.min_psnr.unwrap_or(config.shard.min_psnr);

@@ -1,0 +1,123 @@
+//! What a few views of an object tell without a network: where sampling may start, and so what training should see.
+
+use std::ops::ControlFlow;
+
+use freerange_camera::{SelectionConfig, View, select_views};
+use freerange_fit::{quick_fit, tree_slice};
+use freerange_splat::Cloud;
+use glam::DVec3;
+use rand::{Rng, SeedableRng, seq::index};
+use rand_chacha::ChaCha8Rng;
+
+use crate::{DataError, ObjectConfig};
+
+/// A quick fit of some of an object's views.
+#[derive(Clone, Debug, PartialEq)]
+pub struct InputFit {
+    /// The views it saw, by number.
+    pub views: Vec<usize>,
+    /// Its Gaussians, a power of two of them in the order of their tree.
+    pub gaussians: Cloud,
+}
+
+impl InputFit {
+    /// As `2^depth` Gaussians in the order of their tree.
+    ///
+    /// # Errors
+    /// Where the Gaussians make no tree.
+    pub fn slice(&self, depth: u32) -> Result<Cloud, DataError> {
+        match 1usize.checked_shl(depth) == Some(self.gaussians.len()) {
+            true => Ok(self.gaussians.clone()),
+            false => Ok(tree_slice(&self.gaussians, depth)?),
+        }
+    }
+}
+
+/// Which views a fit sees.
+#[derive(Clone, Copy, Debug)]
+enum Spread {
+    /// One of each cluster, as evaluation's full observation.
+    Around,
+    /// Of one cluster, as its partial observation.
+    OneSide,
+    /// Any.
+    Random,
+}
+
+/// The sets of an object's fits, over and over: equal for all objects, so that a batch has equally many views of each.
+const SETS: [(usize, Spread); 6] = [
+    (4, Spread::Around),
+    (4, Spread::OneSide),
+    (3, Spread::Random),
+    (6, Spread::Random),
+    (2, Spread::Random),
+    (5, Spread::Random),
+];
+
+/// Views that an object with fits has at least: some cluster of four then holds four.
+pub(crate) const MIN_VIEWS: usize = 13;
+
+/// The fits that `config` asks for. Pure.
+pub(crate) fn input_fits(views: &[View], config: &ObjectConfig, seed: u64) -> Result<Vec<InputFit>, DataError> {
+    let centers: Vec<DVec3> = views.iter().map(|v| v.camera.center()).collect();
+    let depth = config.quick_fit.gaussians.ilog2();
+    let one = |number: usize| {
+        // A stream of its own: whether something is fitted must not change the rest of the object.
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        rng.set_stream(16 + number as u64);
+        let chosen = draw_set(&centers, SETS[number % SETS.len()], &mut rng)?;
+        let inputs: Vec<View> = chosen.iter().map(|&i| views[i].clone()).collect();
+        let cloud = quick_fit(&inputs, &config.quick_fit, rng.random(), |_| ControlFlow::Continue(()))?;
+        Ok(InputFit { views: chosen, gaussians: tree_slice(&cloud, depth)? })
+    };
+    (0..config.input_fits).map(one).collect()
+}
+
+fn draw_set(centers: &[DVec3], set: (usize, Spread), rng: &mut ChaCha8Rng) -> Result<Vec<usize>, DataError> {
+    let (count, spread) = set;
+    let selection = SelectionConfig { inputs: count, validation: 1, restarts: 2, seed: rng.random() };
+    Ok(match spread {
+        Spread::Around => select_views(centers, DVec3::ZERO, &selection)?.full,
+        Spread::OneSide => select_views(centers, DVec3::ZERO, &selection)?.partial,
+        Spread::Random => index::sample(rng, centers.len(), count).into_vec(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Object;
+    use crate::tests::tiny_config;
+    use freerange_fit::QuickFitConfig;
+
+    #[test]
+    fn fits_come_from_their_views_alone_and_change_nothing_else() {
+        let mut config = ObjectConfig { views: MIN_VIEWS, ..tiny_config() };
+        let without = Object::generate(5, &config, &[3]).unwrap();
+        config.input_fits = 4;
+        config.quick_fit = QuickFitConfig { iterations: 20, gaussians: 64, render_size: 32 };
+        let with = Object::generate(5, &config, &[3]).unwrap();
+        assert_eq!((&with.slices, &without.slices), (&without.slices, &with.slices));
+        assert_eq!(with.input_fits.iter().map(|f| f.views.len()).collect::<Vec<_>>(), [4, 4, 3, 6]);
+        assert_eq!(with.input_fits, Object::generate(5, &config, &[3]).unwrap().input_fits);
+        for fit in &with.input_fits {
+            let mut views = fit.views.clone();
+            views.sort_unstable();
+            views.dedup();
+            assert_eq!(views.len(), fit.views.len(), "no view twice");
+            assert!(views.iter().all(|&v| v < MIN_VIEWS));
+            assert_eq!(fit.gaussians.len(), 64);
+            // The deepest slice is what is stored; others come from its tree.
+            assert_eq!(fit.slice(6).unwrap(), fit.gaussians);
+            assert_eq!(tree_slice(&fit.gaussians, 6).unwrap().len(), 64);
+            assert_eq!(fit.slice(4).unwrap(), tree_slice(&fit.gaussians, 4).unwrap());
+        }
+        // One side: closer together than around.
+        let spread = |fit: &InputFit| {
+            let c = |i: usize| with.views[i].camera.center().normalize();
+            let pairs = fit.views.iter().flat_map(|&a| fit.views.iter().map(move |&b| (a, b)));
+            pairs.map(|(a, b)| c(a).distance(c(b))).sum::<f64>()
+        };
+        assert!(spread(&with.input_fits[1]) < spread(&with.input_fits[0]));
+    }
+}
