@@ -4,7 +4,7 @@ use std::{ops::ControlFlow, time::Instant};
 
 use burn::tensor::Device;
 use freerange_camera::{CanonicalFrame, FrameConfig, Similarity, Up, View, canonical_from_user, image_ops::composite};
-use freerange_fit::{RefineConfig, refine};
+use freerange_fit::{RefineConfig, quick_fit, refine};
 use freerange_flow::sample::{SampleConfig, reconstruct};
 use freerange_metrics::{psnr, ssim_3dgs};
 use freerange_model::Checkpoint;
@@ -71,8 +71,24 @@ pub fn run(
         true => Progress::silent(),
         false => Progress::new(label, total as u64),
     };
+    let fits = match &options.sample.start {
+        None => None,
+        Some(start) => {
+            let mut bar = bar("fitting", start.fit.iterations);
+            let fit = quick_fit(&canonical, &start.fit, 0, |p| {
+                bar.at(p.step as u64, &format!("loss {:.4}", p.loss));
+                ControlFlow::Continue(())
+            })?;
+            bar.finish();
+            seconds.push(("fit", begin.elapsed().as_secs_f64()));
+            Some([fit])
+        }
+    };
+
+    let begin = Instant::now();
     let mut sampling = bar("sampling", options.sample.steps);
-    let clouds = reconstruct(checkpoint, &[&canonical], &options.sample, &options.seeds, device, |step| {
+    let fits = fits.as_ref().map(|f| f.as_slice());
+    let clouds = reconstruct(checkpoint, &[&canonical], fits, &options.sample, &options.seeds, device, |step| {
         sampling.at(step.index as u64, "");
     })?;
     sampling.finish();

@@ -8,7 +8,7 @@ use freerange_camera::{
     image_ops::{resize_area, to_f32_rgba},
     plucker,
 };
-use freerange_data::Object;
+use freerange_data::{InputFit, Object};
 use freerange_model::{FreeRange, ModelConfig};
 use freerange_splat::{Normalization, channel};
 use glam::DVec3;
@@ -19,6 +19,7 @@ use rand_distr::{Distribution, StandardNormal};
 use crate::{
     FlowError,
     config::{FrameJitter, LossConfig, Stage},
+    path::guess_weight,
     photometric::{Images, Targets},
 };
 
@@ -93,6 +94,12 @@ pub struct Batch {
     pub data: Tensor<3>,
     /// Noise, paired with them. `[b, n, 14]`
     pub noise: Tensor<3>,
+    /// Where the paths are at their times, apart from noise: the data, or between a quick fit and the data. `[b, n, 14]`
+    pub clean: Tensor<3>,
+    /// The quick fits that the paths started from, paired with the data; none if they started from noise. `[b, n, 14]`
+    pub fits: Option<Tensor<3>>,
+    /// Whether the network is fed its own estimate.
+    pub self_conditioned: bool,
     /// Time of each sample.
     pub t: Vec<f32>,
     /// 1 where the sample sees its images, 0 where it is trained unconditionally. `[b, 1, 1]`
@@ -119,24 +126,36 @@ impl Batch {
         device: &Device,
     ) -> Result<Self, FlowError> {
         let (b, n) = (objects.len(), 1usize << stage.depth);
+        let start = loss.start.filter(|start| rng.random::<f32>() < start.share);
+        let self_conditioned = rng.random::<f32>() < loss.self_conditioning;
+        let fits = start.map(|_| same_fit(objects, loss.held_views, rng)).transpose()?;
         let inputs = rng.random_range(loss.input_views.0..=loss.input_views.1);
         let one_sided = rng.random::<f32>() < loss.one_sided;
 
         let mut data = Vec::with_capacity(b * n * channel::COUNT);
         let mut noise = Vec::with_capacity(b * n * channel::COUNT);
+        let (mut on_path, mut guesses) = (Vec::new(), Vec::new());
         let (mut t, mut conditional, mut backgrounds) = (Vec::new(), Vec::new(), Vec::new());
         let (mut seen, mut held) = (Vec::new(), Vec::new());
-        for object in objects {
+        for (i, object) in objects.iter().enumerate() {
             let slice = object.slice(stage.depth)?;
             let mut slice = match loss.random_patches {
                 true => slice.shuffled(rng),
                 false => slice.clone(),
             };
-            let mut start: Vec<f32> = (0..n * channel::COUNT).map(|_| StandardNormal.sample(rng)).collect();
-            t.push(loss.time.time(rng.random()));
-            conditional.push(if rng.random::<f32>() < loss.unconditional { 0.0 } else { 1.0 });
+            let mut epsilon: Vec<f32> = (0..n * channel::COUNT).map(|_| StandardNormal.sample(rng)).collect();
+            let first = start.map_or(0.0, |s| s.time);
+            let time = first + (1.0 - first) * loss.time.draw(rng);
+            // A fit is made of the images: there is no way without them from it.
+            let blind = rng.random::<f32>() < loss.unconditional && start.is_none();
+            t.push(time);
+            conditional.push(if blind { 0.0 } else { 1.0 });
             backgrounds.push(draw_background(rng));
-            let (chosen, rest) = choose_views(&object.views, inputs, one_sided, rng);
+            let fit = fits.as_ref().map(|fits| fits[i]);
+            let (chosen, rest) = match fit {
+                Some(fit) => views_of(fit, &object.views, rng),
+                None => choose_views(&object.views, inputs, one_sided, rng),
+            };
 
             let frame = draw_frame(loss.frame_jitter, rng);
             if frame != Similarity::IDENTITY {
@@ -147,9 +166,20 @@ impl Batch {
             seen.push(chosen.into_iter().map(moved).collect::<Vec<_>>());
             held.push(rest.into_iter().take(loss.held_views).map(moved).collect::<Vec<_>>());
             let clean = normalization.normalize(&slice);
-            loss.coupling.pair(&mut start, &clean);
+            loss.coupling.pair(&mut epsilon, &clean);
+            if let Some(fit) = fit {
+                let mut guess = fit.slice(stage.depth)?;
+                if frame != Similarity::IDENTITY {
+                    guess.transform(frame.scale, frame.rotation, frame.translation);
+                }
+                let mut guess = normalization.normalize(&guess);
+                loss.coupling.pair(&mut guess, &clean);
+                let w = guess_weight(time, first);
+                on_path.extend(clean.iter().zip(&guess).map(|(x, g)| x + w * (g - x)));
+                guesses.extend(guess);
+            }
             data.extend(clean);
-            noise.extend(start);
+            noise.extend(epsilon);
         }
 
         let at = |views: &[Vec<View>], size: u32| {
@@ -158,9 +188,14 @@ impl Batch {
             Ok::<_, FlowError>(Images::new(&small, device)?.on(&backgrounds))
         };
         let shape = [b, n, channel::COUNT];
+        let tensor = |values: Vec<f32>| Tensor::<3>::from_data(TensorData::new(values, shape), device);
+        let data = tensor(data);
         Ok(Self {
-            data: Tensor::from_data(TensorData::new(data, shape), device),
-            noise: Tensor::from_data(TensorData::new(noise, shape), device),
+            clean: if fits.is_some() { tensor(on_path) } else { data.clone() },
+            fits: fits.is_some().then(|| tensor(guesses)),
+            self_conditioned,
+            data,
+            noise: tensor(noise),
             t,
             conditional: Tensor::from_data(TensorData::new(conditional, [b, 1, 1]), device),
             conditioning: Conditioning::new(
@@ -173,6 +208,38 @@ impl Batch {
             held: if loss.held_views > 0 { Some(at(&held, loss.render_size)?) } else { None },
         })
     }
+}
+
+/// A quick fit of each object, of equally many views: which one, is drawn.
+fn same_fit<'a>(
+    objects: &'a [Arc<Object>],
+    held_views: usize,
+    rng: &mut ChaCha8Rng,
+) -> Result<Vec<&'a InputFit>, FlowError> {
+    let most = objects.iter().map(|o| o.input_fits.len()).min().unwrap_or(0);
+    let number = if most > 0 { rng.random_range(0..most) } else { 0 };
+    let count = objects.first().and_then(|o| o.input_fits.get(number)).map_or(0, |f| f.views.len());
+    let fitting = |o: &'a Arc<Object>| {
+        let fit = o.input_fits.get(number);
+        let enough = |f: &&InputFit| f.views.len() == count && count + held_views <= o.views.len();
+        fit.filter(enough).ok_or_else(|| FlowError::Fits {
+            object: o.id.clone(),
+            expected: format!("a quick fit number {number} of {count} views, and {held_views} views besides"),
+            found: {
+                let counts: Vec<usize> = o.input_fits.iter().map(|f| f.views.len()).collect();
+                format!("fits of {counts:?} of its {} views", o.views.len())
+            },
+        })
+    };
+    objects.iter().map(fitting).collect()
+}
+
+/// The views of a fit, and the others in random order.
+fn views_of<'a>(fit: &InputFit, views: &'a [View], rng: &mut ChaCha8Rng) -> (Vec<&'a View>, Vec<&'a View>) {
+    let chosen = fit.views.iter().map(|&i| &views[i]).collect();
+    let mut rest: Vec<&View> = (0..views.len()).filter(|i| !fit.views.contains(i)).map(|i| &views[i]).collect();
+    rest.shuffle(rng);
+    (chosen, rest)
 }
 
 /// How far an object's frame is off, for one step.

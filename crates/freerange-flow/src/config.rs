@@ -5,7 +5,12 @@ use std::path::Path;
 use freerange_data::{BuildConfig, LoadLimits, ObjectConfig, ShardConfig};
 use freerange_model::{Compute, ModelConfig};
 
-use crate::{FlowError, coupling::Coupling, path::TimeSchedule, sample::SampleConfig};
+use crate::{
+    FlowError,
+    coupling::Coupling,
+    path::TimeSchedule,
+    sample::{GradientAt, SampleConfig},
+};
 
 /// A whole training run.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
@@ -116,10 +121,29 @@ pub struct LossConfig {
     pub random_patches: bool,
     /// Fewest and most input views; the number is drawn for each batch.
     pub input_views: (usize, usize),
+    /// Batches that start from quick fits of their input views, which the objects must have; left out: none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub start: Option<StartLoss>,
+    /// Share of the batches in which the network is fed its own estimate, made without a gradient just before
+    /// (`model.estimate_channels`).
+    pub self_conditioning: f32,
+    /// Where the gradient that the network sees is taken; at the noisy sample where there is no estimate.
+    pub gradient_at: GradientAt,
     /// Share of the batches whose input views all lie on one side of the object.
     pub one_sided: f32,
     /// How far the frame that an object is shown in is off its own. A user's frame is estimated from few views.
     pub frame_jitter: FrameJitter,
+}
+
+/// How training starts from quick fits. Such batches have the input views of their fits.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct StartLoss {
+    /// Share of the batches that do; the others start from pure noise, with views drawn anew.
+    pub share: f32,
+    /// The time to which fits are mixed with noise: see [`guess_weight`](crate::path::guess_weight). 0: they start from pure
+    /// noise, and the fit is but an estimate fed to the network.
+    pub time: f32,
 }
 
 /// Standard deviations of the normal distributions that a training object's frame is moved by; 0: not at all.
@@ -148,6 +172,9 @@ impl Default for LossConfig {
             coupling: Coupling::Independent,
             random_patches: false,
             input_views: (4, 4),
+            start: None,
+            self_conditioning: 0.0,
+            gradient_at: GradientAt::Noisy,
             one_sided: 0.0,
             frame_jitter: FrameJitter::default(),
         }
@@ -160,8 +187,10 @@ impl Default for LossConfig {
 pub struct OptimizerConfig {
     /// Highest learning rate, reached after the warm-up.
     pub learning_rate: f64,
-    /// Learning rate at the end of the cosine.
+    /// Learning rate at the end.
     pub final_learning_rate: f64,
+    /// How it gets there.
+    pub schedule: RateSchedule,
     /// Steps of linear warm-up.
     pub warmup: u64,
     /// Decoupled weight decay.
@@ -184,6 +213,7 @@ impl Default for OptimizerConfig {
         Self {
             learning_rate: 1e-4,
             final_learning_rate: 5e-6,
+            schedule: RateSchedule::Cosine,
             warmup: 2000,
             weight_decay: 0.01,
             betas: (0.9, 0.95),
@@ -195,15 +225,34 @@ impl Default for OptimizerConfig {
     }
 }
 
+/// How the learning rate falls after the warm-up.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RateSchedule {
+    /// Along half a cosine over the whole run.
+    #[default]
+    Cosine,
+    /// Not at all until the last `decay` steps, and linearly then: a run can be made longer at any time before.
+    Constant {
+        /// Steps of the fall; 0: none.
+        decay: u64,
+    },
+}
+
 impl OptimizerConfig {
-    /// The learning rate of step `step` of `total`: linear warm-up, then half a cosine.
+    /// The learning rate of step `step` of `total`: linear warm-up, then the schedule.
     pub fn rate(&self, step: u64, total: u64) -> f64 {
         if step < self.warmup {
             return self.learning_rate * (step + 1) as f64 / self.warmup as f64;
         }
-        let progress = (step - self.warmup) as f64 / (total.saturating_sub(self.warmup)).max(1) as f64;
-        let cosine = 0.5 * (1.0 + (std::f64::consts::PI * progress.min(1.0)).cos());
-        self.final_learning_rate + (self.learning_rate - self.final_learning_rate) * cosine
+        let left = match self.schedule {
+            RateSchedule::Cosine => {
+                let progress = (step - self.warmup) as f64 / (total.saturating_sub(self.warmup)).max(1) as f64;
+                0.5 * (1.0 + (std::f64::consts::PI * progress.min(1.0)).cos())
+            }
+            RateSchedule::Constant { decay } => (total.saturating_sub(step) as f64 / decay.max(1) as f64).min(1.0),
+        };
+        self.final_learning_rate + (self.learning_rate - self.final_learning_rate) * left
     }
 }
 
@@ -319,6 +368,24 @@ impl TrainConfig {
         )?;
         check((0.0..=1.0).contains(&l.unconditional), "loss.unconditional", "0 to 1", l.unconditional.to_string())?;
         check((0.0..=1.0).contains(&l.one_sided), "loss.one_sided", "0 to 1", l.one_sided.to_string())?;
+        check(
+            (0.0..=1.0).contains(&l.self_conditioning),
+            "loss.self_conditioning",
+            "0 to 1",
+            l.self_conditioning.to_string(),
+        )?;
+        check(
+            l.self_conditioning == 0.0 || self.model.estimate_channels,
+            "loss.self_conditioning",
+            "0 without model.estimate_channels",
+            l.self_conditioning.to_string(),
+        )?;
+        if let Some(start) = l.start {
+            check((0.0..=1.0).contains(&start.share), "loss.start.share", "0 to 1", start.share.to_string())?;
+            check((0.0..1.0).contains(&start.time), "loss.start.time", "0 to below 1", start.time.to_string())?;
+            let made = self.data.shards.is_some() || self.data.object.input_fits > 0;
+            check(made, "data.object.input_fits", "at least 1 with loss.start", "0".into())?;
+        }
         for (field, value) in
             [("loss.frame_jitter.scale", l.frame_jitter.scale), ("loss.frame_jitter.center", l.frame_jitter.center)]
         {

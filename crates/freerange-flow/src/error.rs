@@ -14,6 +14,16 @@ pub enum FlowError {
         /// Size of the view that differs.
         found: (u32, u32),
     },
+    /// An object lacks the quick fits that training starts from.
+    #[error("object {object}: expected {expected}, found {found}; `freerange data build|generate --fits N` makes them")]
+    Fits {
+        /// The object.
+        object: String,
+        /// What it must have.
+        expected: String,
+        /// What it has.
+        found: String,
+    },
     /// A gradient was asked for where nothing was differentiated.
     #[error("no gradient reached the Gaussians")]
     NoGradient,

@@ -2,7 +2,8 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use freerange_camera::View;
-use freerange_model::{Checkpoint, Compute};
+use freerange_fit::{QuickFitConfig, tree_slice};
+use freerange_model::{Checkpoint, Compute, Feedback};
 use freerange_splat::{Cloud, channel};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -27,6 +28,9 @@ pub struct SampleConfig {
     /// so that any number can be drawn, but sizes are those of the trained depth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub depth: Option<u32>,
+    /// Start from a quick fit of the input views instead of pure noise.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub start: Option<StartConfig>,
     /// Classifier-free guidance scale s: `z_u + s (z_c - z_u)`. 1 switches it off (and halves the work).
     pub guidance: f32,
     /// Photometric guidance scale lambda_PG. 0 switches it off. What it multiplies is told by `photometric_step`.
@@ -56,6 +60,7 @@ impl Default for SampleConfig {
             steps: 50,
             solver: Solver::Euler,
             depth: None,
+            start: None,
             guidance: 2.0,
             photometric: 50.0,
             photometric_step: PhotometricStep::Gradient,
@@ -82,6 +87,19 @@ impl SampleConfig {
         if self.depth.is_some_and(|d| !(1..=20).contains(&d)) {
             return bad("depth", "1 to 20", format!("{:?}", self.depth));
         }
+        if let Some(start) = &self.start {
+            if !(0.0..1.0).contains(&start.time) {
+                return bad("start.time", "0 to below 1", start.time.to_string());
+            }
+            if !(0.0..=2.0).contains(&start.noise) {
+                return bad("start.noise", "0 to 2", start.noise.to_string());
+            }
+            start.fit.check().map_err(|e| FlowError::Config {
+                field: "sample.start.fit".into(),
+                expected: "settings of a quick fit".into(),
+                found: e.to_string(),
+            })?;
+        }
         if !self.guidance.is_finite() || self.guidance < 0.0 {
             return bad("guidance", "a finite number, 0 or more", self.guidance.to_string());
         }
@@ -101,6 +119,25 @@ impl SampleConfig {
     }
 }
 
+/// A start from a quick fit of the input views.
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct StartConfig {
+    /// The time to which the fit is mixed with noise, and from which the flow is integrated; 0: noise alone, in the order of
+    /// the fit.
+    pub time: f32,
+    /// Factor on the noise.
+    pub noise: f32,
+    /// How the fit is made: as in training.
+    pub fit: QuickFitConfig,
+}
+
+impl Default for StartConfig {
+    fn default() -> Self {
+        Self { time: 0.3, noise: 1.0, fit: QuickFitConfig::default() }
+    }
+}
+
 /// Where the photometric gradient that is fed to the network is taken.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -108,7 +145,8 @@ pub enum GradientAt {
     /// At the noisy sample itself, rendered as Gaussians.
     #[default]
     Noisy,
-    /// At the network's estimate of the clean sample in the previous step (the noisy sample in the first).
+    /// At the estimate of the clean sample: the network's in the previous step, at first the quick fit that sampling starts
+    /// from; at the noisy sample where there is none.
     Estimate,
 }
 
@@ -156,7 +194,7 @@ impl Background {
     }
 }
 
-/// How the flow is integrated. All start at pure noise and take uniform steps in time.
+/// How the flow is integrated. All take uniform steps in time.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Solver {
@@ -182,23 +220,24 @@ pub struct Step {
     pub z: Tensor<3>,
 }
 
-/// Integrates the flow `dz/dt = (z1_hat - z) / (1 - t)` from `noise` in `steps` uniform steps; after each, `z <- z - push`.
+/// Integrates the flow `dz/dt = (z1_hat - z) / (1 - t)` from `z` at time `start` in `steps` uniform steps; after each,
+/// `z <- z - push`.
 ///
 /// `estimate` gives the guided estimate z1_hat of the clean sample, `push` the photometric step `lambda grad` taken at the
 /// first estimate of each step (or nothing). Returns the last estimate, which is what the paper denormalises.
 pub fn integrate(
-    noise: Tensor<3>,
+    mut z: Tensor<3>,
+    start: f32,
     steps: usize,
     solver: Solver,
     mut estimate: impl FnMut(&Step) -> Result<Tensor<3>, FlowError>,
     mut push: impl FnMut(&Step, &Tensor<3>) -> Result<Option<Tensor<3>>, FlowError>,
 ) -> Result<Tensor<3>, FlowError> {
-    let time = |i: usize| i as f32 / steps as f32;
-    let mut z = noise;
+    let time = |i: usize| start + (1.0 - start) * i as f32 / steps as f32;
     let mut last = z.clone();
     for index in 0..steps {
         let (t, next) = (time(index), time(index + 1));
-        let share = (1.0 / steps as f32) / (1.0 - t); // of the way from z to the estimate
+        let share = 1.0 / (steps - index) as f32; // of the way from z to the estimate
         let step = Step { index, t, z: z.clone() };
         let before = std::mem::replace(&mut last, estimate(&step)?);
         // Where a straight line to `goal` is at the end of this step.
@@ -235,11 +274,13 @@ pub fn classifier_free(conditional: Tensor<3>, unconditional: Tensor<3>, scale: 
 /// Draws one sample of Gaussians per object and seed that fits the object's posed images. The whole of Section 3.5.
 ///
 /// `objects` are the views of each object, as many for each, in its canonical frame (object within radius 0.5 of the
-/// origin); so are the results, `[objects][seeds]`. All samples run as one batch. `progress` is told each step before it
+/// origin); so are the results, `[objects][seeds]`. `fits` are [quick fits](freerange_fit::quick_fit) of the views of each
+/// object, which `config.start` asks for and nothing else looks at. All samples run as one batch. `progress` is told each step before it
 /// is taken; on a GPU, steps are only queued by then, and nothing waits for them but the end.
 pub fn reconstruct(
     checkpoint: &Checkpoint,
     objects: &[&[View]],
+    fits: Option<&[Cloud]>,
     config: &SampleConfig,
     seeds: &[u64],
     device: &Device,
@@ -268,19 +309,54 @@ pub fn reconstruct(
         Some(size) if size != config.gradient_size => at_size(size)?,
         _ => images.clone(),
     };
+    let starts = match (&config.start, fits) {
+        (None, _) => None,
+        (Some(start), Some(fits)) if fits.len() == objects.len() => Some((start, fits)),
+        (Some(_), given) => {
+            return Err(FlowError::Config {
+                field: "sample.start".into(),
+                expected: format!("a quick fit of each of {} objects", objects.len()),
+                found: given.map_or(0, <[Cloud]>::len).to_string(),
+            });
+        }
+    };
     // Everything random about a sample comes from its own seed, whatever else is in the batch.
     let mut noise = Vec::with_capacity(b * n * channel::COUNT);
     let mut backgrounds = vec![Vec::with_capacity(b); config.steps]; // [steps][b]
-    for &seed in objects.iter().flat_map(|_| seeds) {
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let mut one: Vec<f32> = (0..n * channel::COUNT).map(|_| StandardNormal.sample(&mut rng)).collect();
-        config.coupling.group(&mut one);
-        noise.extend(one);
-        backgrounds.iter_mut().for_each(|step| step.push(config.background.draw(&mut rng)));
+    let mut guesses = Vec::new();
+    for object in 0..objects.len() {
+        let guess = match starts {
+            None => None,
+            Some((_, fits)) => {
+                let slice = tree_slice(&fits[object], n.ilog2()).map_err(freerange_data::DataError::from)?;
+                Some(checkpoint.normalization.normalize(&slice))
+            }
+        };
+        for &seed in seeds {
+            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            let mut one: Vec<f32> = (0..n * channel::COUNT).map(|_| StandardNormal.sample(&mut rng)).collect();
+            match (&guess, starts) {
+                (Some(guess), Some((start, _))) => {
+                    config.coupling.pair(&mut one, guess);
+                    one.iter_mut().for_each(|e| *e *= start.noise);
+                    guesses.extend_from_slice(guess);
+                }
+                _ => config.coupling.group(&mut one),
+            }
+            noise.extend(one);
+            backgrounds.iter_mut().for_each(|step| step.push(config.background.draw(&mut rng)));
+        }
     }
-    let noise = Tensor::from_data(TensorData::new(noise, [b, n, channel::COUNT]), device);
+    let tensor = |values: Vec<f32>| Tensor::<3>::from_data(TensorData::new(values, [b, n, channel::COUNT]), device);
+    let noise = tensor(noise);
+    let guess = starts.is_some().then(|| tensor(guesses));
+    let begin = starts.map_or(0.0, |(start, _)| start.time);
+    let z = match &guess {
+        Some(guess) => noise.mul_scalar(1.0 - begin) + guess.clone().mul_scalar(begin),
+        None => noise,
+    };
 
-    let mut previous: Option<Tensor<3>> = None;
+    let mut previous = guess; // the latest estimate of the clean sample
     let estimate = |step: &Step| {
         progress(step);
         let hint = match checkpoint.config.gradient_channels {
@@ -293,15 +369,17 @@ pub fn reconstruct(
                 Some(scale_gradient(photometric.gradient(at, &images.on(&backgrounds[step.index]))?, &rms))
             }
         };
+        let earlier = previous.clone().filter(|_| checkpoint.config.estimate_channels);
         let estimate = if config.guidance == 1.0 {
             let t = Tensor::full([b], step.t, device);
-            model.denoise(step.z.clone(), hint, tokens.clone(), t)
+            model.denoise(step.z.clone(), Feedback { gradient: hint, estimate: earlier }, tokens.clone(), t)
         } else {
             // Conditional and unconditional branch in one batch.
             let z = step.z.clone().repeat_dim(0, 2);
-            let hint = hint.map(|h| Tensor::cat(vec![h.clone(), h.zeros_like()], 0));
+            let blind = |x: Tensor<3>| Tensor::cat(vec![x.clone(), x.zeros_like()], 0);
             let t = Tensor::full([2 * b], step.t, device);
-            let out = model.denoise(z, hint, both.clone(), t);
+            let feedback = Feedback { gradient: hint.map(blind), estimate: earlier.map(blind) };
+            let out = model.denoise(z, feedback, both.clone(), t);
             classifier_free(out.clone().narrow(0, 0, b), out.narrow(0, b, b), config.guidance)
         };
         previous = Some(estimate.clone());
@@ -319,7 +397,7 @@ pub fn reconstruct(
         }
         Ok(Some(estimate.clone() - moved))
     };
-    let estimate = integrate(noise, config.steps, config.solver, estimate, push)?;
+    let estimate = integrate(z, begin, config.steps, config.solver, estimate, push)?;
 
     let raw = photometric.denormalize(estimate).into_data().try_to_vec::<f32>().map_err(|_| FlowError::NoGradient)?;
     let cloud = |rows: &[f32]| {
@@ -368,7 +446,7 @@ mod tests {
             let (t, rest) = (s.t, 1.0 - s.t);
             Ok((s.z.clone() - t * M).mul_scalar(t * S * S / (t * t * S * S + rest * rest)) + M)
         };
-        let found = integrate(noise.clone(), steps, solver, estimate, |_, _| Ok(None)).unwrap();
+        let found = integrate(noise.clone(), 0.0, steps, solver, estimate, |_, _| Ok(None)).unwrap();
         assert_eq!(calls, if solver == Solver::Heun { 2 * steps - 1 } else { steps });
         let expected = noise.mul_scalar(S) + M;
         (found - expected).abs().max().into_scalar()

@@ -1,7 +1,10 @@
 //! One training step: the whole of Section 3 of the paper, on one screen.
 
-use burn::tensor::{Device, Tensor};
-use freerange_model::FreeRange;
+use burn::{
+    module::Module,
+    tensor::{Device, Tensor},
+};
+use freerange_model::{Feedback, FreeRange};
 
 use crate::{
     FlowError,
@@ -9,7 +12,7 @@ use crate::{
     config::LossConfig,
     path::{flow_loss, interpolate, render_weight},
     photometric::Photometric,
-    sample::scale_gradient,
+    sample::{GradientAt, scale_gradient},
 };
 
 /// The loss of a batch and its terms, each averaged over the batch.
@@ -40,21 +43,35 @@ pub fn step(
 ) -> Result<Losses, FlowError> {
     let b = batch.t.len();
     let t = Tensor::<1>::from_floats(batch.t.as_slice(), device);
-    let noisy = interpolate(batch.noise, batch.data.clone(), t.clone());
+    let noisy = interpolate(batch.noise, batch.clean, t.clone());
 
-    // Photometric gradient at the noisy sample, as extra input channels; zeroed together with the images, lest it
-    // leak them into the unconditional branch.
-    let (hint, gradient_square) = match model.dit().gradient_channels() {
-        true => {
-            let gradient = photometric.gradient(noisy.clone(), &batch.hint)?;
-            let [_, n, c] = gradient.dims();
-            let square = gradient.clone().square().reshape([b * n, c]).mean_dim(0).reshape([c]);
-            (Some(scale_gradient(gradient, gradient_rms) * batch.conditional.clone()), Some(square))
-        }
-        false => (None, None),
+    let tokens = batch.conditioning.encode(model) * batch.conditional.clone();
+    // What is known besides the noisy sample: an earlier estimate of the clean one, and the photometric gradient there.
+    // Both are zeroed together with the images, lest they leak them into the unconditional branch.
+    let feedback = |earlier: Option<Tensor<3>>| -> Result<(Feedback, Option<Tensor<1>>), FlowError> {
+        let gradient = match model.dit().gradient_channels() {
+            true => {
+                let at = earlier.clone().filter(|_| config.gradient_at == GradientAt::Estimate);
+                Some(photometric.gradient(at.unwrap_or_else(|| noisy.clone()), &batch.hint)?)
+            }
+            false => None,
+        };
+        let square = gradient.clone().map(|g| {
+            let [b, n, c] = g.dims();
+            g.square().reshape([b * n, c]).mean_dim(0).reshape([c])
+        });
+        let gradient = gradient.map(|g| scale_gradient(g, gradient_rms) * batch.conditional.clone());
+        let estimate = earlier.filter(|_| model.dit().estimate_channels());
+        Ok((Feedback { gradient, estimate }, square))
     };
-    let tokens = batch.conditioning.encode(model) * batch.conditional;
-    let estimate = model.denoise(noisy, hint, tokens, t.clone()); // z1_hat
+    let mut earlier = batch.fits;
+    if batch.self_conditioned {
+        let (first, _) = feedback(earlier)?;
+        let plain = model.clone().valid();
+        earlier = Some(plain.denoise(noisy.clone(), first, tokens.clone().inner(), t.clone()));
+    }
+    let (feedback, gradient_square) = feedback(earlier)?;
+    let estimate = model.denoise(noisy, feedback, tokens, t.clone()); // z1_hat
 
     let zero = || Tensor::<1>::zeros([b], device);
     let flow = match config.flow {

@@ -413,6 +413,7 @@ fn check_same_run(config: &TrainConfig, folder: &Path) -> Result<(), FlowError> 
                 c.sample = Default::default();
                 c.data.workers = 0;
                 c.optimizer.compute = Default::default();
+                c.optimizer.schedule = Default::default();
                 c
             };
             if essence(&old) != essence(config) {

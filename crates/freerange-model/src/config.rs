@@ -38,6 +38,9 @@ pub struct ModelConfig {
     pub final_layer: FinalLayer,
     /// Whether the photometric gradient is an input beside the noisy Gaussians.
     pub gradient_channels: bool,
+    /// Whether an earlier estimate of the clean Gaussians is one, too (self-conditioning: Chen et al. 2022; not the
+    /// paper's), which the output then corrects: it is added to what the last layer says. Without one, zeros stand for it.
+    pub estimate_channels: bool,
 }
 
 /// How images become tokens.
@@ -115,6 +118,7 @@ impl Default for ModelConfig {
             position_features: 32,
             final_layer: FinalLayer::Adaln,
             gradient_channels: true,
+            estimate_channels: false,
         }
     }
 }
@@ -227,7 +231,8 @@ impl ModelConfig {
 
     /// Width of a Gaussian token before the input projection.
     pub fn gaussian_channels(&self) -> usize {
-        self.gaussians_per_token * CHANNELS * if self.gradient_channels { 2 } else { 1 }
+        let kinds = 1 + usize::from(self.gradient_channels) + usize::from(self.estimate_channels);
+        self.gaussians_per_token * CHANNELS * kinds
     }
 
     /// Tokens in the transformer for `views` images and `gaussians` Gaussians.

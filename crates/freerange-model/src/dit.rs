@@ -27,6 +27,7 @@ pub struct Dit {
     output: Output,
     gaussians_per_token: usize,
     gradient_channels: bool,
+    estimate_channels: bool,
     time_features: usize,
     #[module(skip)]
     compute: Compute,
@@ -38,6 +39,23 @@ pub struct Dit {
 struct TimeMlp {
     first: Linear,
     second: Linear,
+}
+
+/// What the network is told of the Gaussians besides their noisy selves. Both `[b, n, 14]`; what is missing is zeros.
+#[derive(Clone, Debug, Default)]
+pub struct Feedback {
+    /// The photometric gradient at the noisy Gaussians or at an estimate of the clean ones, each channel scaled to unit
+    /// RMS.
+    pub gradient: Option<Tensor<3>>,
+    /// An earlier estimate of the clean Gaussians, normalised.
+    pub estimate: Option<Tensor<3>>,
+}
+
+/// A gradient alone, if any.
+impl From<Option<Tensor<3>>> for Feedback {
+    fn from(gradient: Option<Tensor<3>>) -> Self {
+        Self { gradient, estimate: None }
+    }
 }
 
 /// One transformer block.
@@ -212,6 +230,7 @@ impl Dit {
             },
             gaussians_per_token: config.gaussians_per_token,
             gradient_channels: config.gradient_channels,
+            estimate_channels: config.estimate_channels,
             time_features: config.time_features,
             compute: Compute::F32,
             recompute: false,
@@ -243,23 +262,34 @@ impl Dit {
         self.gradient_channels
     }
 
+    /// Whether [`forward`](Self::forward) takes an earlier estimate.
+    pub fn estimate_channels(&self) -> bool {
+        self.estimate_channels
+    }
+
     /// The conditioning vector of the time: `t` `[b]` in 0..1 to `[b, d]`.
     pub fn condition(&self, t: Tensor<1>) -> Tensor<2> {
         self.t_mlp.second.forward(silu(self.t_mlp.first.forward(time_embedding(t, self.time_features))))
     }
 
     /// The sequence before the first block: registers, image tokens, Gaussian tokens. `[b, t, d]`
-    pub(crate) fn tokens(&self, noisy: Tensor<3>, gradient: Option<Tensor<3>>, image_tokens: Tensor<3>) -> Tensor<3> {
+    pub(crate) fn tokens(&self, noisy: Tensor<3>, feedback: Feedback, image_tokens: Tensor<3>) -> Tensor<3> {
         let [b, n, c] = noisy.dims();
         let p = self.gaussians_per_token;
         assert_eq!(c, CHANNELS, "the noisy Gaussians have {CHANNELS} channels");
         assert!(n.is_multiple_of(p), "{n} Gaussians do not fill tokens of {p}");
-        let gaussians = match (self.gradient_channels, gradient) {
-            (true, Some(gradient)) => Tensor::cat(vec![noisy, gradient], 2),
-            (true, None) => Tensor::cat(vec![noisy.clone(), noisy.zeros_like()], 2),
-            (false, None) => noisy,
-            (false, Some(_)) => panic!("this model is configured without gradient channels"),
-        };
+        let kinds = [
+            ("gradient", self.gradient_channels, feedback.gradient),
+            ("estimate", self.estimate_channels, feedback.estimate),
+        ];
+        let mut gaussians = vec![noisy.clone()];
+        for (name, wanted, given) in kinds {
+            assert!(wanted || given.is_none(), "this model is configured without {name} channels");
+            if wanted {
+                gaussians.push(given.unwrap_or_else(|| noisy.zeros_like()));
+            }
+        }
+        let gaussians = Tensor::cat(gaussians, 2);
         let width = gaussians.dims()[2] * p;
         let gaussians = self.gs_in.forward(gaussians.reshape([b, n / p, width]));
         let mut parts = Vec::with_capacity(3);
@@ -284,24 +314,26 @@ impl Dit {
     /// Predicts the clean Gaussians from noisy ones.
     ///
     /// - `noisy`: `[b, n, 14]`, normalised; `n` a multiple of `gaussians_per_token`
-    /// - `gradient`: photometric gradient at the noisy Gaussians, scaled to unit RMS, `[b, n, 14]`; `None` is zeros
+    /// - `feedback`: what is known besides; of what the model is configured for
     /// - `image_tokens`: `[b, m, image_channels]`; zeros for the unconditional prediction
     /// - `t`: `[b]`, 0 is noise, 1 is data
     ///
     /// Returns the clean Gaussians, normalised, `[b, n, 14]`.
     ///
     /// # Panics
-    /// If shapes do not fit each other, or a gradient is given to a model without gradient channels.
+    /// If shapes do not fit each other, or something is fed back to a model without channels for it.
     pub fn forward(
         &self,
         noisy: Tensor<3>,
-        gradient: Option<Tensor<3>>,
+        feedback: impl Into<Feedback>,
         image_tokens: Tensor<3>,
         t: Tensor<1>,
     ) -> Tensor<3> {
         let [b, n, _] = noisy.dims();
         let gaussian_tokens = n / self.gaussians_per_token;
-        let mut x = self.tokens(noisy, gradient, image_tokens);
+        let feedback = feedback.into();
+        let before = feedback.estimate.clone();
+        let mut x = self.tokens(noisy, feedback, image_tokens);
         let silu_c = silu(self.condition(t)); // [b, d]
         for (i, block) in self.blocks.iter().enumerate() {
             // Only Gaussian tokens leave the last block, so only they need computing there.
@@ -312,6 +344,10 @@ impl Dit {
             let [shift, scale] = chunks(adaln.forward(silu_c));
             x = ops::modulated_norm(x, shift, scale, Compute::F32);
         }
-        self.output.linear.forward(x).reshape([b, n, CHANNELS])
+        let out = self.output.linear.forward(x).reshape([b, n, CHANNELS]);
+        match before {
+            Some(before) => before + out,
+            None => out,
+        }
     }
 }

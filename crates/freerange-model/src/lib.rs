@@ -20,7 +20,7 @@ mod weights;
 
 pub use checkpoint::{Checkpoint, Precision};
 pub use config::{CHANNELS, Dinov2Config, EncoderConfig, FinalLayer, ModelConfig, PLUCKER, PatchConfig};
-pub use dit::{Dit, time_embedding};
+pub use dit::{Dit, Feedback, time_embedding};
 pub use encoder::{Dinov2, ImageEncoder, WeightsOrigin, position_embedding};
 pub use error::ModelError;
 pub use info::{Execution, ModelInfo, PartInfo, TensorInfo, Workload, dinov2_parameters, tensors};

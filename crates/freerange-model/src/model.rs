@@ -7,7 +7,7 @@ use burn::{
 use rand::Rng;
 
 use crate::{
-    Dinov2, Dit, EncoderConfig, ImageEncoder, ModelConfig, ModelError,
+    Dinov2, Dit, EncoderConfig, Feedback, ImageEncoder, ModelConfig, ModelError,
     layers::{Builder, RandomSource, Source},
     ops::Compute,
 };
@@ -103,11 +103,11 @@ impl FreeRange {
     pub fn denoise(
         &self,
         noisy: Tensor<3>,
-        gradient: Option<Tensor<3>>,
+        feedback: impl Into<Feedback>,
         image_tokens: Tensor<3>,
         t: Tensor<1>,
     ) -> Tensor<3> {
-        self.dit.forward(noisy, gradient, image_tokens, t)
+        self.dit.forward(noisy, feedback, image_tokens, t)
     }
 
     /// Every trainable tensor, in a fixed order.

@@ -5,7 +5,7 @@ use burn::{
 
 use super::{Golden, devices, half_devices, numbers, path};
 use crate::{
-    Compute, Dit, EncoderConfig, FinalLayer, FreeRange, ModelConfig, PatchConfig,
+    Compute, Dit, EncoderConfig, Feedback, FinalLayer, FreeRange, ModelConfig, PatchConfig,
     dit::{Parts, time_embedding},
     layers::Builder,
     weights::TensorFile,
@@ -68,7 +68,7 @@ fn whole(name: &str, final_layer: FinalLayer, device: &Device, recompute: bool) 
     dit.set_recompute(recompute);
 
     golden.check("out/cond", dit.condition(t.clone()), 1e-4);
-    let tokens = dit.tokens(z.clone(), Some(gradient.clone()), images.clone());
+    let tokens = dit.tokens(z.clone(), Some(gradient.clone()).into(), images.clone());
     golden.check("out/tokens_0", tokens.clone(), 1e-4);
     golden.check("out/tokens_1", dit.first_block(tokens, t.clone()), 1e-4);
     let unconditional = dit.forward(z.clone(), Some(gradient.clone()), images.zeros_like(), t.clone());
@@ -227,6 +227,32 @@ fn every_token_size_runs_and_starts_at_zero() {
             assert!(numbers(out).iter().all(|&x| x == 0.0), "adaLN-zero: the first prediction is zero");
         }
     }
+}
+
+#[test]
+fn an_estimate_is_corrected() {
+    let device = Device::flex();
+    let config = ModelConfig { estimate_channels: true, ..small(2, true) };
+    assert_eq!(config.gaussian_channels(), 2 * 3 * 14);
+    let mut rng = <rand_chacha::ChaCha8Rng as rand::SeedableRng>::seed_from_u64(3);
+    let model = FreeRange::new(&config, &mut rng, &device).unwrap();
+    let images = Tensor::<3>::ones([2, 4, config.image_token_width()], &device);
+    let z = Tensor::<3>::ones([2, 8, 14], &device);
+    let t = || Tensor::from_floats([0.1, 0.9], &device);
+    let estimate = z.clone().mul_scalar(0.7);
+    let feedback = Feedback { gradient: Some(z.clone()), estimate: Some(estimate.clone()) };
+    // The last layer starts at zero: nothing is corrected yet.
+    assert_eq!(numbers(model.denoise(z.clone(), feedback.clone(), images.clone(), t())), numbers(estimate));
+    let sizes = model.parameters().into_iter().map(|p| p.values.len());
+    let values: Vec<Vec<f32>> =
+        sizes.map(|n| (0..n).map(|_| rand::Rng::random_range(&mut rng, -0.3..0.3)).collect()).collect();
+    let model = model.set_parameters(&values).unwrap();
+    let without = Feedback { estimate: None, ..feedback.clone() };
+    let zeros = Feedback { estimate: Some(z.zeros_like()), ..feedback.clone() };
+    let [with, without, zeros] =
+        [feedback, without, zeros].map(|f| numbers(model.denoise(z.clone(), f, images.clone(), t())));
+    assert_eq!(without, zeros, "zeros stand for no estimate");
+    assert!(with.iter().zip(&without).any(|(a, b)| (a - b - 0.7).abs() > 1e-4), "the network sees it");
 }
 
 #[test]
