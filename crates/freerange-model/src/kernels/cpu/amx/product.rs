@@ -28,10 +28,10 @@ unsafe impl Sync for SharedTiles {}
 
 impl SharedTiles {
     /// # Safety
-    /// The step must lie within the buffer, and nothing else may touch it meanwhile.
-    unsafe fn step(&self, i: usize) -> &mut [Tile; 2] {
+    /// The step must lie within the buffer.
+    unsafe fn step(self, i: usize) -> *mut [Tile; 2] {
         // SAFETY: the caller's promise.
-        unsafe { &mut *self.0.add(i) }
+        unsafe { self.0.add(i) }
     }
 }
 
@@ -41,9 +41,10 @@ fn pack(lines: &Lines, first: usize, steps: usize, out: &mut [Tile]) {
     let out = out.as_chunks_mut::<2>().0;
     assert_eq!(out.len(), strips * steps);
     let out = SharedTiles(out.as_mut_ptr());
-    // SAFETY: each step of each strip is packed once.
-    let pack =
-        |strip: usize, step: usize| lines.pack_step(strip, first + step, unsafe { out.step(strip * steps + step) });
+    // SAFETY: each step of each strip is packed once, all within the buffer.
+    let pack = |strip: usize, step: usize| {
+        lines.pack_step(strip, first + step, unsafe { &mut *out.step(strip * steps + step) })
+    };
     if lines.is_deep() {
         (0..strips).into_par_iter().for_each(|strip| (0..steps).for_each(|step| pack(strip, step)));
     } else {
