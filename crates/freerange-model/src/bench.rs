@@ -74,7 +74,7 @@ impl Block {
         }
     }
 
-    /// The block's attention alone, in f32 or, where `compute` says so and the device is a GPU, in half precision:
+    /// The block's attention alone, in f32 or, where `compute` says so and the device can, in half precision:
     /// `qkv` `[b, t, 3 d]`, f32, with columns ordered `[3, heads, d / heads]`, to `[b, t, d]`.
     pub fn attention(&self, way: Way, qkv: Tensor<3>) -> Tensor<3> {
         let tokens = qkv.dims()[1];
@@ -83,7 +83,7 @@ impl Block {
             Way::Burn => ops::reference::attention(qkv, q, k, self.heads, tokens),
             Way::Fused | Way::Recomputed | Way::Separate => {
                 let qkv = if ops::is_cpu(&qkv.device()) { qkv } else { ops::activation(qkv, self.compute) };
-                ops::attention(qkv, q, k, self.heads, tokens)
+                ops::attention(qkv, q, k, self.heads, tokens, self.compute)
             }
         }
     }

@@ -178,7 +178,7 @@ impl Parts {
             norm: |x, shift, scale| ops::modulated_norm(x, shift, scale, Compute::F32),
             gated: ops::gated_add,
             geglu: ops::geglu,
-            attention: ops::attention,
+            attention: |qkv, q, k, heads, queries| ops::attention(qkv, q, k, heads, queries, Compute::F32),
         }
     }
 

@@ -106,6 +106,10 @@ impl Linear {
         self.compute = compute;
     }
 
+    pub(crate) fn compute(&self) -> Compute {
+        self.compute
+    }
+
     /// `[..., in]` to `[..., out]`.
     pub fn forward<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
         ops::linear(x, self.weight.val(), self.bias.val(), self.compute)

@@ -24,8 +24,8 @@ pub enum Compute {
     /// In f32.
     #[default]
     F32,
-    /// In bf16. On a GPU: operands of products and the activations between them. On a CPU: operands of linear layers'
-    /// products; without AVX-512 BF16 instructions, f32.
+    /// In bf16. On a GPU: operands of products and the activations between them. On a CPU: operands of products on
+    /// Intel's tiles (AMX, on Linux), of linear layers' products with AVX-512 BF16 instructions, f32 without either.
     Bf16,
     /// In f16, on GPUs without bf16. For inference: small gradients vanish. On a CPU: f32.
     F16,
@@ -93,21 +93,22 @@ pub(crate) fn geglu(x: Tensor<3>) -> Tensor<3> {
 /// Self-attention with RMS norm of queries and keys per head.
 ///
 /// `qkv` `[b, t, 3 d]` with columns ordered `[3, heads, d / heads]`, `q_weight` and `k_weight` `[d / heads]`. The
-/// result is computed for the last `queries` tokens: `[b, queries, d]`.
+/// result is computed for the last `queries` tokens: `[b, queries, d]`. On a GPU, `qkv` is of the type to compute in.
 pub(crate) fn attention(
     qkv: Tensor<3>,
     q_weight: Tensor<1>,
     k_weight: Tensor<1>,
     heads: usize,
     queries: usize,
+    compute: Compute,
 ) -> Tensor<3> {
     let (qkv, q_weight, k_weight) = (qkv.into_dispatch(), q_weight.into_dispatch(), k_weight.into_dispatch());
-    Tensor::from_dispatch(Dispatch::qk_norm_attention(qkv, q_weight, k_weight, heads, queries))
+    Tensor::from_dispatch(Dispatch::qk_norm_attention(qkv, q_weight, k_weight, heads, queries, compute))
 }
 
 /// Self-attention of all tokens, without norms; `qkv` as in [`attention`].
-pub(crate) fn plain_attention(qkv: Tensor<3>, heads: usize) -> Tensor<3> {
-    Tensor::from_dispatch(Dispatch::plain_attention(qkv.into_dispatch(), heads))
+pub(crate) fn plain_attention(qkv: Tensor<3>, heads: usize, compute: Compute) -> Tensor<3> {
+    Tensor::from_dispatch(Dispatch::plain_attention(qkv.into_dispatch(), heads, compute))
 }
 
 /// A whole transformer block, see [`crate::kernels::block`]. Of the attention's and the feed-forward network's layers:

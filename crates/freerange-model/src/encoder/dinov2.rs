@@ -259,7 +259,7 @@ impl Layer {
     fn forward(&self, x: Tensor<3>, config: &Dinov2Config) -> Tensor<3> {
         let d = x.dims()[2];
         let y = self.qkv.forward(self.norm1.forward(x.clone(), config.layer_norm_eps));
-        let y = full(self.out.forward(ops::plain_attention(y, config.heads)));
+        let y = full(self.out.forward(ops::plain_attention(y, config.heads, self.qkv.compute())));
         let x = x + y * self.scale1.val().reshape([1, 1, d]);
         let y = full(self.mlp_in.forward(self.norm2.forward(x.clone(), config.layer_norm_eps)));
         let y = match config.swiglu {

@@ -44,9 +44,10 @@ pub(crate) trait FusedOps: Backend {
         k_weight: FloatTensor<Self>,
         heads: usize,
         queries: usize,
+        compute: Compute,
     ) -> FloatTensor<Self>;
     /// Without norms.
-    fn plain_attention(qkv: FloatTensor<Self>, heads: usize) -> FloatTensor<Self>;
+    fn plain_attention(qkv: FloatTensor<Self>, heads: usize, compute: Compute) -> FloatTensor<Self>;
     /// A whole transformer block, see [`block::forward`].
     fn dit_block(
         x: FloatTensor<Self>,
@@ -92,13 +93,14 @@ macro_rules! without_gradients {
                 k_weight: FloatTensor<Self>,
                 heads: usize,
                 queries: usize,
+                compute: Compute,
             ) -> FloatTensor<Self> {
-                Self::attention_forward((qkv, None), Some([q_weight, k_weight]), heads, queries, false).0
+                Self::attention_forward((qkv, None), Some([q_weight, k_weight]), heads, queries, false, compute).0
             }
 
-            fn plain_attention(qkv: FloatTensor<Self>, heads: usize) -> FloatTensor<Self> {
+            fn plain_attention(qkv: FloatTensor<Self>, heads: usize, compute: Compute) -> FloatTensor<Self> {
                 let tokens = tokens::<Self>(&qkv);
-                Self::attention_forward((qkv, None), None, heads, tokens, false).0
+                Self::attention_forward((qkv, None), None, heads, tokens, false, compute).0
             }
 
             fn dit_block(
@@ -187,26 +189,26 @@ impl<B: Kernels> Backward<B, 1> for GegluBackward {
 }
 
 impl<B: Kernels> Backward<B, 3> for AttentionBackward {
-    type State = ([FloatTensor<B>; 5], usize);
+    type State = ([FloatTensor<B>; 5], usize, Compute);
 
     fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _: &mut Checkpointer) {
         let grad = grads.consume::<B>(&ops.node);
         let parents = ops.parents.map(|p| p.map(|node| node.id));
-        let ([qkv, q_weight, k_weight, out, log_sum], heads) = ops.state;
-        let d = B::attention_backward((qkv, None), Some([q_weight, k_weight]), out, log_sum, grad, heads);
+        let ([qkv, q_weight, k_weight, out, log_sum], heads, compute) = ops.state;
+        let d = B::attention_backward((qkv, None), Some([q_weight, k_weight]), out, log_sum, grad, heads, compute);
         let [dq, dk] = d.norms.expect("there were norms");
         register::<B, 3>(grads, parents, [d.qkv, dq, dk]);
     }
 }
 
 impl<B: Kernels> Backward<B, 1> for PlainAttentionBackward {
-    type State = ([FloatTensor<B>; 3], usize);
+    type State = ([FloatTensor<B>; 3], usize, Compute);
 
     fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
         let grad = grads.consume::<B>(&ops.node);
         let parents = ops.parents.map(|p| p.map(|node| node.id));
-        let ([qkv, out, log_sum], heads) = ops.state;
-        let d = B::attention_backward((qkv, None), None, out, log_sum, grad, heads);
+        let ([qkv, out, log_sum], heads, compute) = ops.state;
+        let d = B::attention_backward((qkv, None), None, out, log_sum, grad, heads, compute);
         register::<B, 1>(grads, parents, [d.qkv]);
     }
 }
@@ -300,30 +302,33 @@ impl<B: Kernels, C: CheckpointStrategy> FusedOps for Autodiff<B, C> {
         k_weight: FloatTensor<Self>,
         heads: usize,
         queries: usize,
+        compute: Compute,
     ) -> FloatTensor<Self> {
         let ((qkv, n_qkv), (qw, n_qw), (kw, n_kw)) = (qkv.into_parts(), q_weight.into_parts(), k_weight.into_parts());
         match AttentionBackward.prepare::<C>([n_qkv, n_qw, n_kw]).compute_bound().stateful() {
             OpsKind::Tracked(prep) => {
                 let norms = Some([qw.clone(), kw.clone()]);
-                let (out, log_sum) = B::attention_forward((qkv.clone(), None), norms, heads, queries, true);
+                let (out, log_sum) = B::attention_forward((qkv.clone(), None), norms, heads, queries, true, compute);
                 let log_sum = log_sum.expect("asked to keep it");
-                prep.finish(([qkv, qw, kw, out.clone(), log_sum], heads), out)
+                prep.finish(([qkv, qw, kw, out.clone(), log_sum], heads, compute), out)
             }
             OpsKind::UnTracked(prep) => {
-                prep.finish(B::attention_forward((qkv, None), Some([qw, kw]), heads, queries, false).0)
+                prep.finish(B::attention_forward((qkv, None), Some([qw, kw]), heads, queries, false, compute).0)
             }
         }
     }
 
-    fn plain_attention(qkv: FloatTensor<Self>, heads: usize) -> FloatTensor<Self> {
+    fn plain_attention(qkv: FloatTensor<Self>, heads: usize, compute: Compute) -> FloatTensor<Self> {
         let (qkv, node) = qkv.into_parts();
         let tokens = tokens::<B>(&qkv);
         match PlainAttentionBackward.prepare::<C>([node]).compute_bound().stateful() {
             OpsKind::Tracked(prep) => {
-                let (out, log_sum) = B::attention_forward((qkv.clone(), None), None, heads, tokens, true);
-                prep.finish(([qkv, out.clone(), log_sum.expect("asked to keep it")], heads), out)
+                let (out, log_sum) = B::attention_forward((qkv.clone(), None), None, heads, tokens, true, compute);
+                prep.finish(([qkv, out.clone(), log_sum.expect("asked to keep it")], heads, compute), out)
             }
-            OpsKind::UnTracked(prep) => prep.finish(B::attention_forward((qkv, None), None, heads, tokens, false).0),
+            OpsKind::UnTracked(prep) => {
+                prep.finish(B::attention_forward((qkv, None), None, heads, tokens, false, compute).0)
+            }
         }
     }
 

@@ -106,7 +106,7 @@ pub(crate) fn forward<B: Kernels>(
     let qkv = B::product_forward(normed_a, w.qkv.clone(), w.qkv_bias.clone(), compute);
     let saved_qkv = kept(keep, &qkv);
     let norms = Some([w.q_norm.clone(), w.k_norm.clone()]);
-    let (mixed, log_sum) = B::attention_forward(qkv, norms, heads, queries, keep);
+    let (mixed, log_sum) = B::attention_forward(qkv, norms, heads, queries, keep, compute);
     let saved_mixed = kept(keep, &mixed);
     let attended = B::product_forward(mixed, w.out.clone(), w.out_bias.clone(), compute);
     let saved_attended = kept(keep, &attended);
@@ -167,7 +167,7 @@ pub(crate) fn backward<B: Kernels>(
     let (d_mixed, d_out, at_product) = B::product_backward(saved.mixed.clone(), w.out.clone(), d_attended, compute);
     let d_out_bias = bias(at_gate, at_product);
     let norms = Some([w.q_norm.clone(), w.k_norm.clone()]);
-    let d = B::attention_backward(saved.qkv, norms, saved.mixed, saved.log_sum, d_mixed, heads);
+    let d = B::attention_backward(saved.qkv, norms, saved.mixed, saved.log_sum, d_mixed, heads, compute);
     let (d_normed_a, d_qkv, at_product) = B::product_backward(saved.normed_a, w.qkv.clone(), d.qkv, compute);
     let d_qkv_bias = bias(d.bias, at_product);
     let [d_q_norm, d_k_norm] = d.norms.expect("there were norms");

@@ -95,13 +95,15 @@ pub(crate) trait Kernels: Backend {
     fn geglu_backward(x: Product<Self>, grad: FloatTensor<Self>) -> Product<Self>;
 
     /// The mixed values `[b, queries, d]` and, if `keep`, the log of each softmax's denominator `[b, heads, queries]`.
-    /// `norms` are the weights of the RMS norms of queries and keys; without, there are none.
+    /// `norms` are the weights of the RMS norms of queries and keys; without, there are none. On a GPU, activations are
+    /// of the type to compute in already.
     fn attention_forward(
         qkv: Product<Self>,
         norms: Option<Grads<Self, 2>>,
         heads: usize,
         queries: usize,
         keep: bool,
+        compute: Compute,
     ) -> (FloatTensor<Self>, Option<FloatTensor<Self>>);
     /// Gradients from the inputs, both outputs and the gradient of the first.
     fn attention_backward(
@@ -111,5 +113,6 @@ pub(crate) trait Kernels: Backend {
         log_sum: FloatTensor<Self>,
         grad: FloatTensor<Self>,
         heads: usize,
+        compute: Compute,
     ) -> AttentionGrads<Self>;
 }

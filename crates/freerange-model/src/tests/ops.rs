@@ -165,8 +165,11 @@ fn attention() {
         let d = heads * width;
         check("attention", |r, way| {
             let (qkv, wq, wk) = (r.tensor([b, t, 3 * d]), r.tensor([width]), r.tensor([width]));
-            let attention = if way == Way::Readable { ops::reference::attention } else { ops::attention };
-            let out = attention(way.activation(qkv.clone()), wq.clone(), wk.clone(), heads, queries);
+            let (x, wq_, wk_) = (way.activation(qkv.clone()), wq.clone(), wk.clone());
+            let out = match way {
+                Way::Readable => ops::reference::attention(x, wq_, wk_, heads, queries),
+                Way::Fused(compute) => ops::attention(x, wq_, wk_, heads, queries, compute),
+            };
             results(r, out, |g| vec![grad(&qkv, g), grad(&wq, g), grad(&wk, g)])
         });
     }
@@ -177,10 +180,34 @@ fn attention_without_norms() {
     for [b, t, heads, width] in [[1, 1, 1, 4], [2, 67, 3, 5], [1, 130, 2, 32]] {
         check("plain attention", |r, way| {
             let qkv = r.tensor([b, t, 3 * heads * width]);
-            let plain = if way == Way::Readable { ops::reference::plain_attention } else { ops::plain_attention };
-            let out = plain(way.activation(qkv.clone()), heads);
+            let x = way.activation(qkv.clone());
+            let out = match way {
+                Way::Readable => ops::reference::plain_attention(x, heads),
+                Way::Fused(compute) => ops::plain_attention(x, heads, compute),
+            };
             results(r, out, |g| vec![grad(&qkv, g)])
         });
+    }
+}
+
+/// On the CPU, where operands of products are rounded; in f32 if it cannot.
+#[test]
+fn attention_in_bf16() {
+    for [b, t, heads, width, queries] in
+        [[2, 7, 3, 5, 7], [2, 131, 2, 16, 131], [1, 200, 4, 64, 70], [1, 96, 2, 40, 1], [1, 408, 1, 64, 408]]
+    {
+        let run = |compute: Option<Compute>| {
+            let mut r = Random::new(&Device::flex());
+            let (qkv, wq, wk) = (r.tensor([b, t, 3 * heads * width]), r.tensor([width]), r.tensor([width]));
+            let out = match compute {
+                None => ops::reference::attention(qkv.clone(), wq.clone(), wk.clone(), heads, queries),
+                Some(compute) => ops::attention(qkv.clone(), wq.clone(), wk.clone(), heads, queries, compute),
+            };
+            results(&mut r, out, |g| vec![grad(&qkv, g), grad(&wq, g), grad(&wk, g)])
+        };
+        for (found, truth) in run(Some(Compute::Bf16)).iter().zip(&run(None)) {
+            assert_close(&format!("{t} tokens, {width} wide"), found, truth, 1.5e-2);
+        }
     }
 }
 
@@ -200,7 +227,7 @@ fn attention_without_gradients() {
         let all = devices().into_iter().map(|device| (device, Compute::F32)).chain(half_devices());
         for (device, compute) in all {
             let (qkv, wq, wk) = inputs(&device);
-            let found = numbers(ops::attention(ops::activation(qkv, compute), wq, wk, heads, queries));
+            let found = numbers(ops::attention(ops::activation(qkv, compute), wq, wk, heads, queries, compute));
             let tolerance = if compute == Compute::F32 { 1e-5 } else { 3e-2 };
             assert_close(&format!("{width} wide on {device:?} in {compute:?}"), &found, &truth, tolerance);
         }
@@ -213,7 +240,7 @@ fn attention_survives_extreme_scores() {
         let mut r = Random::new(&device);
         let (qkv, w) = (r.tensor([1, 65, 48]), Tensor::<1>::full([16], 1e4, &r.1));
         let w = w.require_grad();
-        let out = ops::attention(qkv.clone(), w.clone(), w.clone(), 1, 65);
+        let out = ops::attention(qkv.clone(), w.clone(), w.clone(), 1, 65, Compute::F32);
         let gradients = out.clone().sum().backward();
         assert!(numbers(out).iter().all(|x| x.is_finite()));
         assert!(grad(&qkv, &gradients).iter().all(|x| x.is_finite()));
@@ -229,7 +256,7 @@ fn results_do_not_depend_on_the_number_of_threads() {
         let (wq, wk) = (r.tensor([8]), r.tensor([8]));
         let (shift, scale) = (r.tensor([3, 32]), r.tensor([3, 32]));
         let y = ops::modulated_norm(x.clone(), shift.clone(), scale, Compute::Bf16);
-        let y = ops::attention(ops::linear(y, w.clone(), b, Compute::Bf16), wq.clone(), wk, 4, 150);
+        let y = ops::attention(ops::linear(y, w.clone(), b, Compute::Bf16), wq.clone(), wk, 4, 150, Compute::Bf16);
         let y = ops::geglu(ops::gated_add(x.clone(), shift.clone(), y));
         let g = (y.clone() * y).sum().backward();
         [grad(&x, &g), grad(&w, &g), grad(&wq, &g), grad(&shift, &g)].concat()

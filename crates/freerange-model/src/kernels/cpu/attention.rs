@@ -20,21 +20,35 @@ const ROWS: usize = 64;
 
 /// Sizes of one call.
 #[derive(Clone, Copy)]
-struct Sizes {
-    tokens: usize,
-    queries: usize,
-    heads: usize,
-    width: usize,
+pub struct Sizes {
+    pub tokens: usize,
+    pub queries: usize,
+    pub heads: usize,
+    pub width: usize,
 }
 
 impl Sizes {
-    fn d(&self) -> usize {
+    pub fn d(&self) -> usize {
         self.heads * self.width
     }
 
     /// Where part `part` (0 queries, 1 keys, 2 values) of `head` starts in a row of `qkv`.
-    fn column(&self, part: usize, head: usize) -> usize {
+    pub fn column(&self, part: usize, head: usize) -> usize {
         (part * self.heads + head) * self.width
+    }
+
+    /// Writes one head's rows `[n, width]` to rows of `3 d` values, from this token and at this column.
+    ///
+    /// # Safety
+    /// Those columns of those rows of `to` must be valid for writes, and nothing else may touch them meanwhile.
+    pub unsafe fn store(&self, rows: &[f32], first_token: usize, column: usize, to: *mut f32) {
+        for (i, row) in rows.chunks_exact(self.width).enumerate() {
+            // SAFETY: the caller's promise.
+            unsafe {
+                let to = to.add((first_token + i) * 3 * self.d() + column);
+                std::ptr::copy_nonoverlapping(row.as_ptr(), to, self.width);
+            }
+        }
     }
 }
 
@@ -48,7 +62,7 @@ fn scaled(x: &[f32], stride: usize, factor: f32, width: usize, out: &mut [f32]) 
 }
 
 /// Gathers the rows of one head as `factor weight x / rms(x)`, `[n, width]`; without weights, as `factor x`.
-fn gather(x: &[f32], stride: usize, weight: Option<&[f32]>, factor: f32, width: usize, out: &mut [f32]) {
+pub fn gather(x: &[f32], stride: usize, weight: Option<&[f32]>, factor: f32, width: usize, out: &mut [f32]) {
     match weight {
         Some(weight) => normalised(x, stride, weight, factor, out),
         None => scaled(x, stride, factor, width, out),
@@ -56,7 +70,7 @@ fn gather(x: &[f32], stride: usize, weight: Option<&[f32]>, factor: f32, width: 
 }
 
 /// Backward of [`gather`]: turns the gradient rows in `grad` into those of `x`, and adds to that of the weights.
-fn gather_backward(
+pub fn gather_backward(
     x: &[f32],
     stride: usize,
     weight: Option<&[f32]>,
@@ -101,10 +115,12 @@ fn normalised_backward(x: &[f32], stride: usize, weight: &[f32], factor: f32, gr
     }
 }
 
-/// Turns each row of scores into exp(score - largest); stores 1 / sum and the log of the softmax's denominator.
+/// Turns the first `tokens` of each row of scores into exp(score - largest); stores 1 / sum and the log of the softmax's
+/// denominator.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma"))]
-fn softmax_rows(scores: &mut [f32], tokens: usize, inverse_sum: &mut [f32], log_sum: &mut [f32]) {
-    for (i, row) in scores.chunks_exact_mut(tokens).enumerate() {
+pub fn softmax_rows(scores: &mut [f32], stride: usize, tokens: usize, inverse_sum: &mut [f32], log_sum: &mut [f32]) {
+    for (i, row) in scores.chunks_exact_mut(stride).enumerate() {
+        let row = &mut row[..tokens];
         let largest = math::max(row);
         for s in row.iter_mut() {
             *s = math::exp(*s - largest);
@@ -140,10 +156,24 @@ fn scale_row(row: &mut [f32], factor: f32) {
 }
 
 /// The norms' weights of queries and keys.
-type Weights<'a> = [&'a [f32]; 2];
+pub type Weights<'a> = [&'a [f32]; 2];
 
 fn weights(norms: &[FlexTensor; 2]) -> Weights<'_> {
     [values(&norms[0]), values(&norms[1])]
+}
+
+/// [`head_forward`].
+type Forward = unsafe fn(&[f32], Option<Weights<'_>>, Sizes, usize, *mut f32, &mut [f32]);
+/// [`head_backward`].
+type Backward = unsafe fn(Saved<'_>, Option<Weights<'_>>, Sizes, usize, *mut f32) -> (Vec<f32>, Vec<f32>);
+
+/// In bf16 where asked for and the CPU has tiles; products as small as these gain nothing from vectors of bf16.
+fn by_head(bf16: bool) -> (Forward, Backward) {
+    match bf16 {
+        #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+        true if super::amx::available() => (super::amx::head_forward, super::amx::head_backward),
+        _ => (head_forward, head_backward),
+    }
 }
 
 /// See [`crate::kernels::Kernels::attention_forward`].
@@ -152,6 +182,7 @@ pub fn forward(
     norms: Option<[FlexTensor; 2]>,
     heads: usize,
     queries: usize,
+    bf16: bool,
 ) -> (FlexTensor, FlexTensor) {
     let (qkv, norms) = (contiguous(qkv), norms.map(|norms| norms.map(contiguous)));
     let [b, tokens, d3] = dims(&qkv);
@@ -162,6 +193,7 @@ pub fn forward(
     let mut out = vec![0f32; b * queries * d];
     let mut log_sum = vec![0f32; b * heads * queries];
     let target = Shared(out.as_mut_ptr());
+    let (head_forward, _) = by_head(bf16);
     log_sum.par_chunks_mut(queries.max(1)).enumerate().for_each(|(task, log_sum)| {
         let (batch, head) = (task / heads, task % heads);
         let rows = &xs[batch * tokens * d3..][..tokens * d3];
@@ -201,7 +233,7 @@ unsafe fn head_forward(
         // SAFETY: `scores` is ours; the rows of `out` are by the caller's promise.
         unsafe {
             matmul([n, width, tokens], q, k, 1.0, scores.as_mut_ptr(), tokens, false, Parallelism::None);
-            softmax_rows(&mut scores[..n * tokens], tokens, &mut inverse_sum, &mut log_sum[first..first + n]);
+            softmax_rows(&mut scores[..n * tokens], tokens, tokens, &mut inverse_sum, &mut log_sum[first..first + n]);
             let out = out.add(first * sizes.d());
             let p = Matrix::rows(&scores, tokens);
             matmul([n, tokens, width], p, v, 1.0, out, sizes.d(), false, Parallelism::None);
@@ -220,6 +252,7 @@ pub fn backward(
     log_sum: FlexTensor,
     grad: FlexTensor,
     heads: usize,
+    bf16: bool,
 ) -> (FlexTensor, Option<[FlexTensor; 2]>) {
     let (qkv, norms) = (contiguous(qkv), norms.map(|norms| norms.map(contiguous)));
     let (out, log_sum, grad) = (contiguous(out), contiguous(log_sum), contiguous(grad));
@@ -230,6 +263,7 @@ pub fn backward(
     let (outs, log_sums, grads) = (values(&out), values(&log_sum), values(&grad));
     let mut d_qkv = vec![0f32; xs.len()];
     let target = Shared(d_qkv.as_mut_ptr());
+    let (_, head_backward) = by_head(bf16);
     let d_weights: Vec<_> = (0..b * heads)
         .into_par_iter()
         .map(|task| {
@@ -255,11 +289,11 @@ pub fn backward(
 
 /// What the gradient of one head needs of its image.
 #[derive(Clone, Copy)]
-struct Saved<'a> {
-    rows: &'a [f32],    // [tokens, 3 d]
-    out: &'a [f32],     // [queries, d]
-    grad: &'a [f32],    // [queries, d]
-    log_sum: &'a [f32], // [queries]
+pub struct Saved<'a> {
+    pub rows: &'a [f32],    // [tokens, 3 d]
+    pub out: &'a [f32],     // [queries, d]
+    pub grad: &'a [f32],    // [queries, d]
+    pub log_sum: &'a [f32], // [queries]
 }
 
 /// Returns the gradients of both norm weights.
@@ -323,16 +357,10 @@ unsafe fn head_backward(
         gather_backward(q_rows, stride, weights.map(|w| w[0]), factor, &mut dq, &mut d_wq);
     }
     gather_backward(k_rows, stride, weights.map(|w| w[1]), 1.0, &mut dk, &mut d_wk);
-    let store = |rows: &[f32], first_token: usize, column: usize| {
-        for (i, row) in rows.chunks_exact(width).enumerate() {
-            // SAFETY: a row of this head's columns, by the caller's promise.
-            unsafe {
-                let to = d_rows.add((first_token + i) * stride + column);
-                std::ptr::copy_nonoverlapping(row.as_ptr(), to, width);
-            }
-        }
-    };
-    store(&dq, tokens - queries, sizes.column(0, head));
-    store(&dk, 0, sizes.column(1, head));
+    // SAFETY: this head's columns, by the caller's promise.
+    unsafe {
+        sizes.store(&dq, tokens - queries, sizes.column(0, head), d_rows);
+        sizes.store(&dk, 0, sizes.column(1, head), d_rows);
+    }
     (d_wq, d_wk)
 }

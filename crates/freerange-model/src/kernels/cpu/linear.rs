@@ -4,6 +4,8 @@ use burn::backend::flex::FlexTensor;
 use gemm::Parallelism;
 use rayon::prelude::*;
 
+#[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+use super::amx;
 use super::{bf16, contiguous, dims, math, tensor, values};
 
 /// A read-only matrix inside a slice: element (i, j) is `data[i * rows + j * columns]`.
@@ -23,6 +25,11 @@ impl<'a> Matrix<'a> {
     /// The transpose, without moving anything.
     pub fn transposed(self) -> Self {
         Self { row_stride: self.column_stride, column_stride: self.row_stride, ..self }
+    }
+
+    /// All but the first rows.
+    pub fn below(self, first: usize) -> Self {
+        Self { data: &self.data[first * self.row_stride..], ..self }
     }
 
     /// Whether `[rows, columns]` lie within the slice.
@@ -77,14 +84,26 @@ fn parallelism(shape: [usize; 3]) -> Parallelism {
     if shape.iter().product::<usize>() < 1 << 22 { Parallelism::None } else { Parallelism::Rayon(0) }
 }
 
-/// A whole product into a new or prepared `[m, n]` buffer; in bf16 where asked for and the CPU can.
-pub fn product(shape: [usize; 3], a: Matrix, b: Matrix, out: &mut [f32], add: bool, in_bf16: bool) {
-    if in_bf16 && bf16::available() {
-        return bf16::product(shape, a, b, out, add);
+/// `bias + a b`, with the bias added to every row; in bf16 where asked for and the CPU can.
+fn product(shape @ [m, _, n]: [usize; 3], a: Matrix, b: Matrix, bias: Option<&[f32]>, in_bf16: bool) -> Vec<f32> {
+    #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+    if in_bf16 && amx::available() {
+        return amx::product(shape, a, b, bias);
     }
-    assert_eq!(out.len(), shape[0] * shape[2]);
-    // SAFETY: `out` is exclusively borrowed and has m rows of n values.
-    unsafe { matmul(shape, a, b, 1.0, out.as_mut_ptr(), shape[2], add, parallelism(shape)) }
+    let mut out = vec![0f32; m * n];
+    if let Some(bias) = bias {
+        out.par_chunks_mut(ROWS * n.max(1)).for_each(|piece| {
+            piece.chunks_exact_mut(n).for_each(|row| row.copy_from_slice(bias));
+        });
+    }
+    if in_bf16 && bf16::available() {
+        bf16::product(shape, a, b, &mut out, bias.is_some());
+    } else {
+        let out = out.as_mut_ptr();
+        // SAFETY: `out` is ours and has m rows of n values.
+        unsafe { matmul(shape, a, b, 1.0, out, n, bias.is_some(), parallelism(shape)) }
+    }
+    out
 }
 
 /// Rows per piece of work; fixed, so that sums do not depend on the number of threads.
@@ -96,13 +115,9 @@ pub fn forward(x: FlexTensor, w: FlexTensor, b: FlexTensor, bf16: bool) -> FlexT
     let mut shape = x.layout().shape().to_vec();
     assert_eq!(shape.last(), Some(&inputs), "linear: input width");
     let rows = values(&x).len() / inputs;
-    let bias = values(&b);
-    let mut out = vec![0f32; rows * outputs];
-    out.par_chunks_mut(ROWS * outputs).for_each(|piece| {
-        piece.chunks_exact_mut(outputs).for_each(|row| row.copy_from_slice(bias));
-    });
     let weight = Matrix::rows(values(&w), inputs).transposed();
-    product([rows, inputs, outputs], Matrix::rows(values(&x), inputs), weight, &mut out, true, bf16);
+    let x = Matrix::rows(values(&x), inputs);
+    let out = product([rows, inputs, outputs], x, weight, Some(values(&b)), bf16);
     if let Some(last) = shape.last_mut() {
         *last = outputs;
     }
@@ -121,12 +136,10 @@ pub fn backward(
     let rows = values(&x).len() / inputs;
     let g = Matrix::rows(values(&grad), outputs);
     let dx = need_x.then(|| {
-        let mut dx = vec![0f32; rows * inputs];
-        product([rows, outputs, inputs], g, Matrix::rows(values(&w), inputs), &mut dx, false, bf16);
+        let dx = product([rows, outputs, inputs], g, Matrix::rows(values(&w), inputs), None, bf16);
         tensor(dx, &x.layout().shape().to_vec())
     });
-    let mut dw = vec![0f32; outputs * inputs];
-    product([outputs, rows, inputs], g.transposed(), Matrix::rows(values(&x), inputs), &mut dw, false, bf16);
+    let dw = product([outputs, rows, inputs], g.transposed(), Matrix::rows(values(&x), inputs), None, bf16);
     let db = column_sums(values(&grad), outputs);
     (dx, tensor(dw, &[outputs, inputs]), tensor(db, &[outputs]))
 }

@@ -2,8 +2,11 @@
 //!
 //! Work is split into pieces whose number does not depend on the number of threads, and partial sums are added in
 //! order, so that results are the same on every machine with the same instruction set. Half precision means operands
-//! of linear layers' products rounded to bf16, where the processor has instructions for that; all tensors are f32.
+//! of products rounded to bf16, where the processor has instructions for that: a tile unit for those of linear layers and
+//! attention, or vectors for linear layers. All tensors are f32.
 
+#[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+mod amx;
 mod attention;
 mod bf16;
 mod linear;
@@ -123,8 +126,9 @@ impl Kernels for Flex {
         heads: usize,
         queries: usize,
         _: bool,
+        compute: Compute,
     ) -> (FlexTensor, Option<FlexTensor>) {
-        let (out, log_sum) = attention::forward(complete(qkv), norms, heads, queries);
+        let (out, log_sum) = attention::forward(complete(qkv), norms, heads, queries, compute == Compute::Bf16);
         (out, Some(log_sum))
     }
 
@@ -135,8 +139,10 @@ impl Kernels for Flex {
         log_sum: FlexTensor,
         grad: FlexTensor,
         heads: usize,
+        compute: Compute,
     ) -> AttentionGrads<Self> {
-        let (qkv, norms) = attention::backward(complete(qkv), norms, out, log_sum, grad, heads);
+        let bf16 = compute == Compute::Bf16;
+        let (qkv, norms) = attention::backward(complete(qkv), norms, out, log_sum, grad, heads, bf16);
         AttentionGrads { qkv, bias: None, norms }
     }
 }

@@ -182,6 +182,7 @@ impl Kernels for CubeBackend {
         heads: usize,
         queries: usize,
         keep: bool,
+        _: Compute,
     ) -> (CubeTensor, Option<CubeTensor>) {
         attention::forward(qkv, norms, heads, queries, keep)
     }
@@ -193,6 +194,7 @@ impl Kernels for CubeBackend {
         log_sum: CubeTensor,
         grad: CubeTensor,
         heads: usize,
+        _: Compute,
     ) -> AttentionGrads<Self> {
         attention::backward(qkv, norms, out, log_sum, grad, heads)
     }
