@@ -7,6 +7,7 @@ pub mod config;
 pub mod coupling;
 mod error;
 mod inherit;
+mod optimizer;
 pub mod path;
 pub mod photometric;
 pub mod sample;
