@@ -24,7 +24,7 @@ pub struct Options {
     pub sample: SampleConfig,
     /// One result per seed.
     pub seeds: Vec<u64>,
-    /// Gradient steps on the input views after sampling; 0 for none.
+    /// Steps of 3DGS-MCMC on the input views after sampling; 0 for none.
     pub refine: usize,
     /// Which way is up in the user's frame.
     pub up: Up,

@@ -175,7 +175,7 @@ pub struct HoldConfig {
 
 impl Default for HoldConfig {
     fn default() -> Self {
-        Self { weight: 0.2, views: 12, size: 128, radius: 0.5 }
+        Self { weight: 0.1, views: 12, size: 128, radius: 0.5 }
     }
 }
 
