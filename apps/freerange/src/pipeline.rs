@@ -4,7 +4,7 @@ use std::{ops::ControlFlow, time::Instant};
 
 use burn::tensor::Device;
 use freerange_camera::{CanonicalFrame, FrameConfig, Similarity, Up, View, canonical_from_user, image_ops::composite};
-use freerange_fit::{RefineConfig, quick_fit, refine};
+use freerange_fit::{RefineConfig, quick_fit, refine, tree_slice};
 use freerange_flow::sample::{SampleConfig, reconstruct};
 use freerange_metrics::{psnr, ssim_3dgs};
 use freerange_model::Checkpoint;
@@ -24,7 +24,9 @@ pub struct Options {
     pub sample: SampleConfig,
     /// One result per seed.
     pub seeds: Vec<u64>,
-    /// Gradient steps on the input views after sampling; 0 for none.
+    /// Leave the network out: what sampling would start from is the sample. The control of every comparison.
+    pub without_network: bool,
+    /// Steps of 3DGS-MCMC on the input views after sampling; 0 for none.
     pub refine: usize,
     /// Which way is up in the user's frame.
     pub up: Up,
@@ -87,10 +89,19 @@ pub fn run(
 
     let begin = Instant::now();
     let mut sampling = bar("sampling", options.sample.steps);
-    let fits = fits.as_ref().map(|f| f.as_slice());
-    let clouds = reconstruct(checkpoint, &[&canonical], fits, &options.sample, &options.seeds, device, |step| {
-        sampling.at(step.index as u64, "");
-    })?;
+    let clouds = match (&fits, options.without_network) {
+        (Some([fit]), true) => {
+            let slice = tree_slice(fit, options.sample.depth.unwrap_or(checkpoint.depth))?;
+            vec![vec![slice; options.seeds.len()]]
+        }
+        (None, true) => return Err(CliError::input("sample.start: expected a quick fit to start from, found none")),
+        (fits, false) => {
+            let fits = fits.as_ref().map(|f| f.as_slice());
+            reconstruct(checkpoint, &[&canonical], fits, &options.sample, &options.seeds, device, |step| {
+                sampling.at(step.index as u64, "");
+            })?
+        }
+    };
     sampling.finish();
     seconds.push(("sample", begin.elapsed().as_secs_f64()));
 

@@ -34,14 +34,28 @@ impl Shards {
     /// of the manifest; [`DataError::Io`].
     pub fn open(store: &Store, depths: &[u32], split: Option<Split>) -> Result<Self, DataError> {
         let manifest = Manifest::load(store)?;
+        if !manifest.is_complete() {
+            let (found, expected) = (manifest.shards.len(), manifest.plan.shard_count());
+            let problem = format!("expected {expected} shards, found {found}: let their making finish first");
+            return Err(DataError::File { path: store.path(""), problem });
+        }
+        Self::of(manifest, store, depths, split)
+    }
+
+    /// As [`open`](Self::open), but of a folder that is still being made, takes the shards that are finished by now. The
+    /// order of the objects changes with their number.
+    ///
+    /// # Errors
+    /// As [`open`](Self::open).
+    pub fn open_finished(store: &Store, depths: &[u32], split: Option<Split>) -> Result<Self, DataError> {
+        Self::of(Manifest::load(store)?, store, depths, split)
+    }
+
+    fn of(manifest: Manifest, store: &Store, depths: &[u32], split: Option<Split>) -> Result<Self, DataError> {
         let problem = |problem: String| DataError::File { path: store.path(""), problem };
         let found = &manifest.plan.config.depths;
         if let Some(depth) = depths.iter().find(|d| !found.contains(d)) {
             return Err(problem(format!("expected Gaussians at depth {depth}, found depths {found:?}")));
-        }
-        if !manifest.is_complete() {
-            let (found, expected) = (manifest.shards.len(), manifest.plan.shard_count());
-            return Err(problem(format!("expected {expected} shards, found {found}: let their making finish first")));
         }
         // Local ones only: asking for the size of thousands of remote files takes minutes.
         if store.folder().is_some() {

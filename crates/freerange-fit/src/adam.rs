@@ -13,14 +13,14 @@ const EPSILON: f32 = 1e-15;
 pub(crate) type ChannelRates = [f32; channel::COUNT];
 
 impl Rates {
-    /// The rate of every channel, those of all but the centres times `factor`.
-    pub(crate) fn by_channel(&self, mean: f64, factor: f64) -> ChannelRates {
+    /// The rate of every channel, `mean` being that of the centres.
+    pub(crate) fn by_channel(&self, mean: f64) -> ChannelRates {
         let mut out = [0.0; channel::COUNT];
         out[channel::MEAN].fill(mean as f32);
-        out[channel::LOG_SCALE].fill((factor * self.scale) as f32);
-        out[channel::ROTATION].fill((factor * self.rotation) as f32);
-        out[channel::LOGIT_OPACITY] = (factor * self.opacity) as f32;
-        out[channel::COLOR].fill((factor * self.color) as f32);
+        out[channel::LOG_SCALE].fill(self.scale as f32);
+        out[channel::ROTATION].fill(self.rotation as f32);
+        out[channel::LOGIT_OPACITY] = self.opacity as f32;
+        out[channel::COLOR].fill(self.color as f32);
         out
     }
 }
@@ -94,7 +94,7 @@ mod tests {
 
     fn rates() -> ChannelRates {
         let r = Rates { mean: 1.0, scale: 2.0, rotation: 3.0, opacity: 4.0, color: 5.0 };
-        r.by_channel(r.mean, 1.0)
+        r.by_channel(r.mean)
     }
 
     #[test]

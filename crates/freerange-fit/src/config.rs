@@ -114,46 +114,68 @@ impl Default for FitConfig {
     }
 }
 
-/// Settings of [`refine`](crate::refine). All rates fall to zero along a half cosine. The defaults suit objects in the
-/// canonical frame (a sphere of radius 0.5 about the origin).
+/// Settings of [`refine`](crate::refine). The defaults suit objects in the canonical frame (a sphere of radius 0.5 about
+/// the origin).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct RefineConfig {
-    /// Optimisation steps; each one looks at every view.
+    /// Optimisation steps; each one looks at one view, and at one picture of the hold.
     pub steps: usize,
+    /// Number of Gaussians at the end; a cloud that has more keeps its number.
+    pub gaussians: usize,
+    /// Rounds of relocation and growth, spread evenly over the steps up to the last sixth.
+    pub growth_rounds: usize,
     /// Learning rates at the start.
     pub rates: Rates,
+    /// What the learning rate of the centres has become at the end, exponentially. The others stay as they are.
+    pub final_mean_rate: f64,
     /// Weight of 1 - SSIM; that of L1 is the rest. 0..1
     pub lambda_ssim: f64,
-    /// Weight of the mean squared distance of the Gaussians from where they started, in the loss. Units: centres in the
-    /// Gaussian's own initial size (root mean square of its standard deviations), the other channels in theirs.
-    pub anchor: f64,
-    /// Weight of the mean opacity in the loss.
-    pub opacity_regularizer: f64,
-    /// Factor by which a standard deviation may at most grow or shrink; at least 1. It keeps Gaussians from becoming
-    /// needles that only fit the given views.
-    pub scale_limit: f64,
     /// What the Gaussians are rendered in front of.
     pub background: Background,
     /// Longest side, in pixels, at which views are compared; larger ones are shrunk. None: as they are.
     pub render_size: Option<u32>,
-    /// Seed of the backgrounds.
+    /// What keeps the cloud where no view looks.
+    pub hold: HoldConfig,
+    /// Seed of everything drawn.
     pub seed: u64,
 }
 
 impl Default for RefineConfig {
     fn default() -> Self {
         Self {
-            steps: 200,
-            rates: Rates { mean: 7e-4, scale: 6e-3, rotation: 2e-3, opacity: 0.02, color: 5e-3 },
+            steps: 500,
+            gaussians: 4096,
+            growth_rounds: 16,
+            rates: Rates { mean: 1.5e-3, scale: 5e-3, ..FitConfig::default().rates },
+            final_mean_rate: 1.5e-5,
             lambda_ssim: 0.2,
-            anchor: 0.002,
-            opacity_regularizer: 0.0,
-            scale_limit: 2.0,
             background: Background::Random,
-            render_size: Some(128),
+            render_size: Some(256),
+            hold: HoldConfig::default(),
             seed: 0,
         }
+    }
+}
+
+/// Pictures of the cloud before a refinement, taken from all around it: further views that the refined one has to agree
+/// with.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct HoldConfig {
+    /// Weight of the mean absolute difference from a picture, beside a loss of weight 1 on a view. 0: no hold.
+    pub weight: f64,
+    /// Number of pictures.
+    pub views: usize,
+    /// Their width and height in pixels.
+    pub size: u32,
+    /// Radius of the sphere around the origin that they show. World units.
+    pub radius: f64,
+}
+
+impl Default for HoldConfig {
+    fn default() -> Self {
+        Self { weight: 0.1, views: 12, size: 128, radius: 0.5 }
     }
 }
 
@@ -227,16 +249,56 @@ impl FitConfig {
     }
 }
 
+/// Part of the steps of a refinement after which there are no more rounds of growth: the last Gaussians have to settle.
+const GROWTH_STOP: f64 = 5.0 / 6.0;
+
 impl RefineConfig {
     /// Refuses values that no refinement can work with.
     pub fn check(&self) -> Result<(), FitError> {
+        let steps = self.steps;
+        at_least_one("steps", steps)?;
+        check("gaussians", "1 to 16777216", self.gaussians, (1..=MAX_GAUSSIANS).contains(&self.gaussians))?;
         self.rates.check()?;
+        positive("rates.mean", self.rates.mean)?;
+        positive("final_mean_rate", self.final_mean_rate)?;
         fraction("lambda_ssim", self.lambda_ssim)?;
-        finite_not_negative("anchor", self.anchor)?;
-        finite_not_negative("opacity_regularizer", self.opacity_regularizer)?;
-        let limit = self.scale_limit;
-        check("scale_limit", "a finite number, at least 1", limit, limit >= 1.0 && limit.is_finite())?;
-        check_render_size(self.render_size)
+        check_render_size(self.render_size)?;
+        self.hold.check()
+    }
+
+    /// The fit that goes on from a cloud of `start` Gaussians.
+    pub(crate) fn fit(&self, start: usize) -> FitConfig {
+        let most = self.gaussians.max(start);
+        // A round comes at every multiple of the interval but step 0.
+        let last = GROWTH_STOP * self.steps as f64;
+        let interval = ((last / (self.growth_rounds + 1) as f64) as usize).max(1);
+        let rounds = ((last / interval as f64).ceil() as i32 - 1).max(1);
+        FitConfig {
+            iterations: self.steps,
+            max_gaussians: most,
+            initial: start,
+            growth_interval: interval,
+            growth_start: if self.growth_rounds == 0 { usize::MAX } else { interval },
+            growth_stop: GROWTH_STOP,
+            // One Gaussian more, since rounds round down.
+            growth: (most as f64 / start as f64).powf(1.0 / f64::from(rounds)) + 1.0 / start as f64,
+            rates: self.rates,
+            final_mean_rate: self.final_mean_rate,
+            lambda_ssim: self.lambda_ssim,
+            background: self.background,
+            render_size: self.render_size,
+            seed: self.seed,
+            ..FitConfig::default()
+        }
+    }
+}
+
+impl HoldConfig {
+    fn check(&self) -> Result<(), FitError> {
+        finite_not_negative("hold.weight", self.weight)?;
+        check("hold.views", "1 to 1000", self.views, (1..=1000).contains(&self.views))?;
+        check("hold.size", "16 to 1024", self.size, (16..=1024).contains(&self.size))?;
+        positive("hold.radius", self.radius)
     }
 }
 
@@ -275,7 +337,41 @@ mod tests {
         refused(&|c| c.lambda_ssim = 1.1, "lambda_ssim");
         refused(&|c| c.rates.color = f64::INFINITY, "rates.color");
         refused(&|c| c.render_size = Some(0), "render_size");
-        assert!(RefineConfig { scale_limit: f64::NAN, ..Default::default() }.check().is_err());
-        assert!(RefineConfig { anchor: -1.0, ..Default::default() }.check().is_err());
+        let refused = |change: &dyn Fn(&mut RefineConfig), field: &str| {
+            let mut config = RefineConfig::default();
+            change(&mut config);
+            let message = config.check().unwrap_err().to_string();
+            assert!(message.starts_with(field), "{message}");
+        };
+        refused(&|c| c.steps = 0, "steps");
+        refused(&|c| c.gaussians = 0, "gaussians");
+        refused(&|c| c.rates.mean = 0.0, "rates.mean");
+        refused(&|c| c.final_mean_rate = f64::NAN, "final_mean_rate");
+        refused(&|c| c.hold.weight = -1.0, "hold.weight");
+        refused(&|c| c.hold.views = 0, "hold.views");
+        refused(&|c| c.hold.size = 8, "hold.size");
+        refused(&|c| c.hold.radius = f64::INFINITY, "hold.radius");
+    }
+
+    /// However few the steps and large the start, the fit is possible and its growth reaches the number asked for.
+    #[test]
+    fn a_refinement_grows_to_its_number() {
+        for (steps, start, growth_rounds) in
+            [(500, 1024, 16), (1, 1024, 16), (20, 1, 16), (1000, 5000, 16), (300, 9, 0), (7, 3, 1)]
+        {
+            let config = RefineConfig { steps, growth_rounds, ..Default::default() };
+            let fit = config.fit(start);
+            fit.check().unwrap();
+            let due = |step: &usize| {
+                *step >= fit.growth_start
+                    && step % fit.growth_interval == 0
+                    && (*step as f64) < fit.growth_stop * steps as f64
+            };
+            let rounds = (0..steps).filter(due).count();
+            assert_eq!(rounds > 0, growth_rounds > 0 && steps > 2, "{rounds} of {growth_rounds}");
+            assert!(rounds <= 2 * growth_rounds, "{rounds} of {growth_rounds}");
+            let grown = (0..rounds).fold(start, |count, _| crate::mcmc::grown(count, &fit));
+            assert!(rounds == 0 || grown == start.max(4096), "{grown} after {rounds}");
+        }
     }
 }

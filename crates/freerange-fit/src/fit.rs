@@ -27,36 +27,49 @@ pub fn fit(
     views: &[View],
     initial: Option<&Cloud>,
     config: &FitConfig,
-    mut progress: impl FnMut(&FitProgress) -> ControlFlow<()>,
+    progress: impl FnMut(&FitProgress) -> ControlFlow<()>,
 ) -> Result<Cloud, FitError> {
     config.check()?;
     let targets = Targets::new(views, config.render_size)?;
     let mut rng = ChaCha8Rng::seed_from_u64(config.seed);
-    let mut cloud = match initial {
+    let cloud = match initial {
         Some(cloud) => checked(cloud, config.max_gaussians)?,
         None => random_cloud(&targets, config, &mut rng),
     };
+    optimise(cloud, &targets, config, &mut rng, |_, _, _| Ok(()), progress)
+}
+
+/// The optimisation itself. `more` adds further terms to the objective of a cloud over a background.
+pub(crate) fn optimise(
+    mut cloud: Cloud,
+    targets: &Targets,
+    config: &FitConfig,
+    rng: &mut ChaCha8Rng,
+    mut more: impl FnMut(&mut Objective, &Cloud, [f32; 3]) -> Result<(), FitError>,
+    mut progress: impl FnMut(&FitProgress) -> ControlFlow<()>,
+) -> Result<Cloud, FitError> {
     let mut adam = Adam::default();
     let mut queue = Vec::new();
     for step in 0..config.iterations {
         let done = step as f64 / config.iterations as f64;
         let mean_rate = config.rates.mean * (config.final_mean_rate / config.rates.mean).powf(done);
 
-        let chosen = next_views(&mut queue, views.len(), config.views_per_step, &mut rng);
-        let background = config.background.draw(&mut rng);
-        let mut objective = Objective::photometric(&cloud, &targets, &chosen, background, config.lambda_ssim)?;
+        let chosen = next_views(&mut queue, targets.cameras.len(), config.views_per_step, rng);
+        let background = config.background.draw(rng);
+        let mut objective = Objective::photometric(&cloud, targets, &chosen, background, config.lambda_ssim)?;
         let loss = objective.loss;
+        more(&mut objective, &cloud, background)?;
         objective.add_opacity(&cloud, config.opacity_regularizer);
         objective.add_scale(&cloud, config.scale_regularizer);
         objective.check(step)?;
-        adam.step(cloud.rows_mut(), &objective.gradients, &config.rates.by_channel(mean_rate, 1.0));
+        adam.step(cloud.rows_mut(), &objective.gradients, &config.rates.by_channel(mean_rate));
         normalize_rotations(&mut cloud);
 
         let due = step >= config.growth_start && step % config.growth_interval == 0;
         if due && done < config.growth_stop {
-            relocate_and_grow(&mut cloud, &mut adam, config, &mut rng);
+            relocate_and_grow(&mut cloud, &mut adam, config, rng);
         }
-        add_noise(&mut cloud, config.noise * mean_rate, config.dead_opacity, &mut rng);
+        add_noise(&mut cloud, config.noise * mean_rate, config.dead_opacity, rng);
         check_cloud(&cloud, step)?;
 
         let now = FitProgress { step: step + 1, steps: config.iterations, loss, gaussians: cloud.len() };
@@ -84,7 +97,7 @@ pub(crate) fn checked(cloud: &Cloud, most: usize) -> Result<Cloud, FitError> {
 }
 
 /// The next views to look at: all of them once in random order, then again.
-fn next_views(queue: &mut Vec<usize>, count: usize, per_step: usize, rng: &mut ChaCha8Rng) -> Vec<usize> {
+pub(crate) fn next_views(queue: &mut Vec<usize>, count: usize, per_step: usize, rng: &mut ChaCha8Rng) -> Vec<usize> {
     let mut chosen = Vec::new();
     while chosen.len() < per_step.min(count) {
         if queue.is_empty() {

@@ -1,7 +1,7 @@
 //! 3DGS-MCMC: posed views in, 3D Gaussians out.
 //!
 //! * [`fit`]: from nothing but views (Kheradmand et al. 2024), which is how training objects become clouds.
-//! * [`refine`]: a few gradient steps on a cloud that is already good.
+//! * [`refine`]: the same from a cloud that is already good, held where no view looks.
 //!
 //! Plain Rust over the rasteriser's CPU functions; no tensor library.
 
@@ -9,6 +9,7 @@ mod adam;
 mod config;
 mod error;
 mod fit;
+mod hold;
 mod init;
 mod mcmc;
 mod objective;
@@ -18,7 +19,7 @@ mod refine;
 mod tests;
 mod views;
 
-pub use config::{Background, FitConfig, Rates, RefineConfig};
+pub use config::{Background, FitConfig, HoldConfig, Rates, RefineConfig};
 pub use error::FitError;
 pub use fit::fit;
 pub use quick::{QuickFitConfig, quick_fit, tree_slice};

@@ -71,16 +71,6 @@ impl Objective {
         });
     }
 
-    /// Adds the mean over the Gaussians of `sum_c weights_c (x_c - anchor_c)^2 / 2`. `weights` is `[n, 14]`.
-    pub fn add_anchor(&mut self, cloud: &Cloud, anchor: &Cloud, weights: &[f32]) {
-        let share = 1.0 / cloud.len() as f32;
-        for (((g, x), a), w) in self.gradients.iter_mut().zip(cloud.rows()).zip(anchor.rows()).zip(weights) {
-            let pull = share * w * (x - a);
-            *g += pull;
-            self.loss += f64::from(0.5 * pull * (x - a));
-        }
-    }
-
     /// Refuses to go on with what is not finite.
     pub fn check(&self, step: usize) -> Result<(), FitError> {
         let refuse = |what| Err(FitError::Diverged { step, what });
@@ -180,7 +170,11 @@ pub(crate) fn normalize_rotations(cloud: &mut Cloud) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::tests::{ball, ring};
+    use crate::{
+        HoldConfig,
+        hold::Hold,
+        tests::{ball, ring},
+    };
 
     /// The rectangle of differences gives what the whole image gives.
     #[test]
@@ -223,13 +217,14 @@ mod tests {
     #[test]
     fn gradients_match_finite_differences() {
         let targets = Targets::new(&ring(3, 24, &ball(12, 1)), None).unwrap();
-        let (anchor, mut cloud) = (ball(12, 2), ball(12, 3));
-        let weights: Vec<f32> = (0..cloud.rows().len()).map(|i| 0.1 + 0.01 * (i % 7) as f32).collect();
+        let mut cloud = ball(12, 3);
+        let hold = HoldConfig { weight: 0.5, views: 5, size: 24, ..Default::default() };
+        let hold = Hold::new(&ball(12, 2), &hold).unwrap();
         let value = |cloud: &Cloud| {
             let mut o = Objective::photometric(cloud, &targets, &[0, 2], [0.3, 0.6, 0.1], 0.2).unwrap();
             o.add_opacity(cloud, 0.3);
             o.add_scale(cloud, 0.7);
-            o.add_anchor(cloud, &anchor, &weights);
+            hold.add(&mut o, cloud, 1, [0.3, 0.6, 0.1]).unwrap();
             o
         };
         let gradients = value(&cloud).gradients;

@@ -44,6 +44,9 @@ pub struct DataConfig {
     /// Shards made by `freerange data build`: a folder, or a URL (`s3://`, `gs://`, `https://`). Without it, objects are
     /// generated on the fly, without end.
     pub shards: Option<String>,
+    /// Train on the shards that are finished by now where the folder is still being made; a run that goes on later takes
+    /// those of then, and is no longer the one never stopped.
+    pub partial: bool,
     /// How an object is made: its Gaussians, views and cameras.
     pub object: ObjectConfig,
     /// What shards keep of each object, and how objects are divided.
@@ -68,6 +71,7 @@ impl Default for DataConfig {
     fn default() -> Self {
         Self {
             shards: None,
+            partial: false,
             object: ObjectConfig::default(),
             shard: ShardConfig::default(),
             build: BuildOverrides::default(),

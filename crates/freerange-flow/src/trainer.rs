@@ -104,7 +104,10 @@ impl Trainer {
         }
         let plain = device.clone().inner();
         let source: Arc<dyn ObjectSource> = match &config.data.shards {
-            Some(place) => Arc::new(Shards::open(&Store::open(place)?, &config.depths(), Some(Split::Train))?),
+            Some(place) => {
+                let open = if config.data.partial { Shards::open_finished } else { Shards::open };
+                Arc::new(open(&Store::open(place)?, &config.depths(), Some(Split::Train))?)
+            }
             None => Arc::new(Generated {
                 config: config.data.object.clone(),
                 depths: config.depths(),

@@ -131,7 +131,7 @@ fn gpu_samples_as_the_cpu_does() {
             depth: 5,
             provenance: serde_json::Value::Null,
         };
-        let clouds = reconstruct(&checkpoint, &views, &config.sample, &[1, 2], device, |_| {}).unwrap();
+        let clouds = reconstruct(&checkpoint, &views, None, &config.sample, &[1, 2], device, |_| {}).unwrap();
         assert_eq!(clouds.iter().map(Vec::len).collect::<Vec<_>>(), [2, 2]);
         clouds.iter().flatten().flat_map(|c| c.rows().to_vec()).collect::<Vec<f32>>()
     };

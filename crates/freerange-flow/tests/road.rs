@@ -122,7 +122,7 @@ fn one_object_is_learned_sampled_and_rendered() {
     };
     let object = source.object(0).unwrap();
     let (inputs, unseen) = object.views.split_at(4);
-    let clouds = reconstruct(&checkpoint, &[inputs], &config.sample, &[5, 6], &device, |_| {}).unwrap().remove(0);
+    let clouds = reconstruct(&checkpoint, &[inputs], None, &config.sample, &[5, 6], &device, |_| {}).unwrap().remove(0);
     assert_eq!(clouds.len(), 2);
     assert_ne!(clouds[0], clouds[1], "another seed is another sample");
 
@@ -154,7 +154,7 @@ fn one_object_is_learned_sampled_and_rendered() {
             photometric_size,
             ..config.sample.clone()
         };
-        reconstruct(&checkpoint, &[inputs], &guidance, &[5], &device, |_| {}).unwrap().remove(0).remove(0)
+        reconstruct(&checkpoint, &[inputs], None, &guidance, &[5], &device, |_| {}).unwrap().remove(0).remove(0)
     });
     for (i, a) in sampled[..5].iter().enumerate() {
         assert!(sampled[..i].iter().all(|b| a != b), "each way is another one");
@@ -163,12 +163,12 @@ fn one_object_is_learned_sampled_and_rendered() {
     assert_eq!(sampled[5], sampled[2], "gradient_size is what a left out photometric_size means");
 
     // Another batch: two objects (the second sees other views), one seed.
-    let both = reconstruct(&checkpoint, &[inputs, unseen], &config.sample, &[5], &device, |_| {}).unwrap();
+    let both = reconstruct(&checkpoint, &[inputs, unseen], None, &config.sample, &[5], &device, |_| {}).unwrap();
     let worst = |a: &Cloud, b: &Cloud| a.rows().iter().zip(b.rows()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
     assert_eq!(both.iter().map(Vec::len).collect::<Vec<_>>(), [1, 1]);
     let off = worst(&both[0][0], &clouds[0]);
     assert!(off < 1e-2, "the same seed in another batch gives the same sample, up to rounding: off by {off}");
-    let alone = reconstruct(&checkpoint, &[unseen], &config.sample, &[5], &device, |_| {}).unwrap();
+    let alone = reconstruct(&checkpoint, &[unseen], None, &config.sample, &[5], &device, |_| {}).unwrap();
     assert!(worst(&both[1][0], &alone[0][0]) < 1e-2);
     assert_ne!(both[0][0], both[1][0]);
 }

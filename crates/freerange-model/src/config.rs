@@ -39,8 +39,11 @@ pub struct ModelConfig {
     /// Whether the photometric gradient is an input beside the noisy Gaussians.
     pub gradient_channels: bool,
     /// Whether an earlier estimate of the clean Gaussians is one, too (self-conditioning: Chen et al. 2022; not the
-    /// paper's), which the output then corrects: it is added to what the last layer says. Without one, zeros stand for it.
+    /// paper's). Without one, zeros stand for it.
     pub estimate_channels: bool,
+    /// Whether the last layer tells but the correction, of unit variance at all times, to what the noisy Gaussians and the
+    /// earlier estimate say together (preconditioning: Karras et al. 2022; not the paper's).
+    pub preconditioned: bool,
 }
 
 /// How images become tokens.
@@ -119,6 +122,7 @@ impl Default for ModelConfig {
             final_layer: FinalLayer::Adaln,
             gradient_channels: true,
             estimate_channels: false,
+            preconditioned: false,
         }
     }
 }

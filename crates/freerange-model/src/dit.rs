@@ -28,6 +28,7 @@ pub struct Dit {
     gaussians_per_token: usize,
     gradient_channels: bool,
     estimate_channels: bool,
+    preconditioned: bool,
     time_features: usize,
     #[module(skip)]
     compute: Compute,
@@ -194,6 +195,22 @@ impl Parts {
     }
 }
 
+/// What `noisy`, at time `t`, tells of clean Gaussians that are normal about `estimate` (zeros if none) with unit variance:
+/// their mean `[b, n, 14]` and their standard deviation `[b, 1, 1]`.
+///
+/// With `z = t x + (1 - t) eps` these are `e + t (z - t e) / v` and `(1 - t) / sqrt(v)`, where `v = t^2 + (1 - t)^2`.
+fn best_linear(noisy: Tensor<3>, estimate: Option<Tensor<3>>, t: Tensor<1>) -> (Tensor<3>, Tensor<3>) {
+    let t = t.unsqueeze_dims::<3>(&[1, 2]); // [b, 1, 1]
+    let rest = t.clone().neg().add_scalar(1.0);
+    let variance = t.clone().square() + rest.clone().square();
+    let deviation = rest / variance.clone().sqrt();
+    let mean = noisy * (t / variance);
+    match estimate {
+        Some(estimate) => (mean + estimate * deviation.clone().square(), deviation),
+        None => (mean, deviation),
+    }
+}
+
 /// `[b, n d]` to n times `[b, d]`.
 fn chunks<const N: usize>(m: Tensor<2>) -> [Tensor<2>; N] {
     let d = m.dims()[1] / N;
@@ -231,6 +248,7 @@ impl Dit {
             gaussians_per_token: config.gaussians_per_token,
             gradient_channels: config.gradient_channels,
             estimate_channels: config.estimate_channels,
+            preconditioned: config.preconditioned,
             time_features: config.time_features,
             compute: Compute::F32,
             recompute: false,
@@ -332,7 +350,7 @@ impl Dit {
         let [b, n, _] = noisy.dims();
         let gaussian_tokens = n / self.gaussians_per_token;
         let feedback = feedback.into();
-        let before = feedback.estimate.clone();
+        let known = self.preconditioned.then(|| best_linear(noisy.clone(), feedback.estimate.clone(), t.clone()));
         let mut x = self.tokens(noisy, feedback, image_tokens);
         let silu_c = silu(self.condition(t)); // [b, d]
         for (i, block) in self.blocks.iter().enumerate() {
@@ -345,8 +363,8 @@ impl Dit {
             x = ops::modulated_norm(x, shift, scale, Compute::F32);
         }
         let out = self.output.linear.forward(x).reshape([b, n, CHANNELS]);
-        match before {
-            Some(before) => before + out,
+        match known {
+            Some((mean, deviation)) => mean + out * deviation,
             None => out,
         }
     }

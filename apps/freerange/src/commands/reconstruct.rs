@@ -51,7 +51,8 @@ pub struct Sampling {
     /// Model to use instead of the shipped one.
     #[arg(long, value_name = "FILE")]
     pub checkpoint: Option<PathBuf>,
-    /// Continue from the sample with so many gradient steps on the input views.
+    /// Continue from the sample with so many steps of 3DGS-MCMC on the input views, up to 4,096 Gaussians and held in
+    /// place where no view looks; 500 are enough.
     #[arg(long, default_value_t = 0, value_name = "STEPS")]
     pub refine: usize,
     /// Seed of the (first) sample.
@@ -60,6 +61,9 @@ pub struct Sampling {
     /// Steps from noise to Gaussians [default: the checkpoint's].
     #[arg(long)]
     pub steps: Option<usize>,
+    /// Start from a quick fit of the input views (fit) or from pure noise (noise) [default: the checkpoint's].
+    #[arg(long, value_enum)]
+    pub start: Option<StartName>,
     /// Make 2^DEPTH Gaussians [default: the depth of the level-of-detail tree that the checkpoint was trained at].
     #[arg(long, value_parser = clap::value_parser!(u32).range(4..=16))]
     pub depth: Option<u32>,
@@ -81,6 +85,15 @@ pub struct Sampling {
     /// Where to compute: auto, cpu, or cuda, metal, vulkan, webgpu with a number if there are several, as in cuda:1.
     #[arg(long, default_value = "auto")]
     pub device: DeviceName,
+}
+
+/// Where sampling starts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum StartName {
+    /// A quick fit of the input views.
+    Fit,
+    /// Pure noise, as in the paper.
+    Noise,
 }
 
 /// Which way is up.
@@ -123,6 +136,11 @@ impl Sampling {
         };
         sample.steps = self.steps.unwrap_or(sample.steps);
         sample.depth = self.depth.or(sample.depth);
+        sample.start = match self.start {
+            Some(StartName::Noise) => None,
+            Some(StartName::Fit) => Some(sample.start.unwrap_or_default()),
+            None => sample.start,
+        };
         sample.guidance = self.guidance.unwrap_or(sample.guidance);
         sample.photometric = self.photometric.unwrap_or(sample.photometric);
         sample.solver = self.solver.unwrap_or(sample.solver);
@@ -132,6 +150,7 @@ impl Sampling {
         Ok(Options {
             sample,
             seeds: (0..u64::from(samples)).map(|i| self.seed.wrapping_add(i)).collect(),
+            without_network: false,
             refine: self.refine,
             up: self.up(),
             quiet: false,

@@ -191,6 +191,7 @@ fn interruptions_shares_and_threads_leave_no_trace() {
     }
     assert!(message(open(cut.path(), &[2])).contains("expected 3 shards, found 1"));
     assert!(!inspect(&Store::local(cut.path()), true).unwrap().complete);
+    assert_eq!(Shards::open_finished(&Store::local(cut.path()), &[2], None).unwrap().len(), 4, "one shard of four");
     let summary = run(cut.path(), &workers);
     assert_eq!((summary.made, summary.skipped), (4, 6), "objects of unfinished shards are kept");
     assert_eq!(contents(cut.path()), expected);

@@ -1,10 +1,11 @@
 //! Sampling and training as a whole.
 
-use std::{path::Path, time::Instant};
+use std::{ops::ControlFlow, path::Path, time::Instant};
 
 use burn::tensor::{Distribution, Tensor};
 use freerange_camera::View;
 use freerange_data::{GaussianSource, Object};
+use freerange_fit::quick_fit;
 use freerange_flow::{
     batch::{Conditioning, shrink},
     config::{Stage, TrainConfig},
@@ -142,8 +143,15 @@ pub fn sample(
     }
 
     // The whole, as `reconstruct` does it. One step first: every kernel is compiled by then.
-    let run =
-        |steps| reconstruct(&checkpoint, &batch, &SampleConfig { steps, ..settings.clone() }, &[0], device, |_| {});
+    let fit = match &settings.start {
+        Some(start) => Some(quick_fit(&views, &start.fit, 0, |_| ControlFlow::Continue(()))?),
+        None => None,
+    };
+    let fits = fit.map(|fit| vec![fit; objects]);
+    let run = |steps| {
+        let settings = SampleConfig { steps, ..settings.clone() };
+        reconstruct(&checkpoint, &batch, fits.as_deref(), &settings, &[0], device, |_| {})
+    };
     run(1)?;
     let begin = Instant::now();
     run(steps)?;

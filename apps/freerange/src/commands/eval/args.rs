@@ -124,24 +124,31 @@ impl RunArgs {
             (MethodName::Ply, Some(folder)) if !folder.is_dir() => {
                 return Err(CliError::file(folder, "expected a folder of .ply files"));
             }
-            (MethodName::Model | MethodName::Fit | MethodName::White, Some(_)) => {
+            (MethodName::Model | MethodName::Start | MethodName::Fit | MethodName::White, Some(_)) => {
                 return refuse("--ply DIR goes with --method ply only");
             }
             _ => {}
         }
-        let drawn = matches!(self.method, MethodName::Model | MethodName::Fit);
+        let drawn = matches!(self.method, MethodName::Model | MethodName::Start | MethodName::Fit);
         if !drawn && (self.samples > 1 || self.inputs.len() > 1) {
             return refuse("--method white and ply: expected one sample and one number of inputs, they change nothing");
         }
-        if self.method != MethodName::Model && self.sampling.refine > 0 {
-            return refuse("--refine goes with --method model only");
+        let samples = matches!(self.method, MethodName::Model | MethodName::Start);
+        if !samples && self.sampling.refine > 0 {
+            return refuse("--refine goes with --method model and start only");
         }
         Ok(match self.method {
-            MethodName::Model => {
+            MethodName::Model | MethodName::Start => {
                 let path = self.sampling.checkpoint.as_deref();
                 let checkpoint = checkpoint(path, device)?;
                 let mut options = self.sampling.options(&checkpoint, self.samples, device)?;
                 options.quiet = true;
+                options.without_network = self.method == MethodName::Start;
+                if options.without_network && options.sample.start.is_none() {
+                    return refuse(
+                        "--method start: expected a checkpoint that starts from a quick fit, or --start fit",
+                    );
+                }
                 (Method::Model { options, sha256: checkpoint_sha256(path)? }, Some(Arc::new(checkpoint)))
             }
             MethodName::Fit => {

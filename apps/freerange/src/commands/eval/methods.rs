@@ -23,6 +23,8 @@ use crate::{
 pub enum MethodName {
     /// The model.
     Model,
+    /// The model's pipeline with the network left out: the quick fit that sampling starts from, as it is.
+    Start,
     /// 3DGS-MCMC on the input views alone, without a model.
     Fit,
     /// No Gaussians at all: a white image.
@@ -80,6 +82,10 @@ impl Method {
     /// What it is called in tables.
     pub fn label(&self) -> String {
         match self {
+            Self::Model { options, .. } if options.without_network => match options.refine {
+                0 => "without the network".into(),
+                steps => format!("without the network, refined {steps}"),
+            },
             Self::Model { options, .. } if options.refine > 0 => format!("model, refined {}", options.refine),
             Self::Model { .. } => "model".into(),
             Self::Fit { .. } => "3DGS-MCMC fit".into(),
@@ -92,7 +98,7 @@ impl Method {
     pub fn settings(&self) -> Value {
         match self {
             Self::Model { options, sha256 } => json!({
-                "name": "model", "checkpoint_sha256": sha256, "sample": options.sample, "seeds": options.seeds,
+                "name": if options.without_network { "start" } else { "model" }, "checkpoint_sha256": sha256, "sample": options.sample, "seeds": options.seeds,
                 "refine": options.refine, "up": format!("{:?}", options.up).to_lowercase(),
             }),
             Self::Fit { config, seeds, up } => json!({

@@ -1,0 +1,88 @@
+//! What keeps a refinement where no photo looks: pictures of the cloud as it was before.
+
+use crate::{FitError, HoldConfig, objective::Objective};
+use freerange_camera::Camera;
+use freerange_raster::{RasterConfig, render, render_backward};
+use freerange_splat::Cloud;
+use glam::DVec3;
+
+/// Distance of the cameras from the origin, in radii of the sphere that holds the object: training cameras' own.
+const DISTANCE: f64 = 3.5;
+/// Part of the image's width that the sphere fills.
+const FILLED: f64 = 0.9;
+/// Highest and lowest cameras, as sines of the elevation.
+const HIGHEST: f64 = 0.9;
+/// Pictures are compared as small ones that stand for images of so many pixels a side.
+const FULL_SIZE: f32 = 512.0;
+/// Differences of colours that are rounding.
+const EQUAL: f32 = 1e-6;
+
+/// Pictures of a cloud from all around it.
+pub(crate) struct Hold {
+    pictures: Vec<Picture>,
+    raster: RasterConfig,
+    weight: f64,
+}
+
+struct Picture {
+    camera: Camera,
+    /// Premultiplied, over black. `[size, size, 3]`
+    rgb: Vec<f32>,
+    alpha: Vec<f32>, // [size, size]
+}
+
+/// Cameras spread evenly over the sphere but for its poles (a Fibonacci spiral), looking at the origin.
+fn cameras(config: &HoldConfig) -> impl Iterator<Item = Camera> + '_ {
+    let golden = std::f64::consts::PI * (3.0 - 5f64.sqrt());
+    let fov = 2.0 * ((1.0 / DISTANCE).asin().tan() / FILLED).atan();
+    (0..config.views).map(move |i| {
+        let z = HIGHEST * (1.0 - (2 * i + 1) as f64 / config.views as f64);
+        let (r, angle) = ((1.0 - z * z).sqrt(), golden * i as f64);
+        let eye = DISTANCE * config.radius * DVec3::new(r * angle.cos(), r * angle.sin(), z);
+        Camera::look_at(eye, DVec3::ZERO, DVec3::Z, fov, config.size, config.size)
+    })
+}
+
+impl Hold {
+    /// Pictures of `start`; none where they would have no weight.
+    pub fn new(start: &Cloud, config: &HoldConfig) -> Result<Self, FitError> {
+        let raster = RasterConfig::default().shrunk(config.size as f32 / FULL_SIZE);
+        let picture = |camera| {
+            let out = render(start.rows(), &[camera], &[[0.0; 3]], &raster)?;
+            Ok(Picture { camera, rgb: out.rgb, alpha: out.alpha })
+        };
+        let wanted = if config.weight > 0.0 { usize::MAX } else { 0 };
+        let pictures = cameras(config).take(wanted).map(picture).collect::<Result<_, FitError>>()?;
+        Ok(Self { pictures, raster, weight: config.weight })
+    }
+
+    /// Number of pictures.
+    pub fn views(&self) -> usize {
+        self.pictures.len()
+    }
+
+    /// Adds the mean absolute difference between picture `view` and `cloud`, both over `background`, times the weight.
+    pub fn add(
+        &self,
+        objective: &mut Objective,
+        cloud: &Cloud,
+        view: usize,
+        background: [f32; 3],
+    ) -> Result<(), FitError> {
+        let Picture { camera, rgb, alpha } = &self.pictures[view];
+        let out = render(cloud.rows(), &[*camera], &[background], &self.raster)?;
+        let share = (self.weight / out.rgb.len() as f64) as f32;
+        let mut d_rgb = vec![0.0; out.rgb.len()];
+        let pixels = out.rgb.as_chunks::<3>().0.iter().zip(rgb.as_chunks::<3>().0).zip(alpha);
+        for (d, ((found, held), alpha)) in d_rgb.as_chunks_mut::<3>().0.iter_mut().zip(pixels) {
+            for c in 0..3 {
+                let difference = found[c] - (held[c] + (1.0 - alpha) * background[c]);
+                objective.loss += f64::from(share * difference.abs());
+                d[c] = if difference.abs() < EQUAL { 0.0 } else { share.copysign(difference) };
+            }
+        }
+        let gradients = render_backward(cloud.rows(), &out, &d_rgb, &[], &[])?.gaussians;
+        objective.gradients.iter_mut().zip(gradients).for_each(|(sum, g)| *sum += g);
+        Ok(())
+    }
+}
