@@ -7,11 +7,8 @@ use burn::backend::flex::FlexTensor;
 use multiversion::multiversion;
 use rayon::prelude::*;
 
-use super::{contiguous, dims, into_values, math, tensor, values};
+use super::{contiguous, dims, into_values, linear::ROWS, math, tensor, values};
 use crate::ops::EPS;
-
-/// Rows per piece of work; fixed, so that sums do not depend on the number of threads.
-const ROWS: usize = 32;
 
 /// Calls `f(first row, rows of out)` for pieces of `ROWS` rows that do not cross batch elements, in parallel, and
 /// collects what it returns: `[b][pieces per batch element]`.
@@ -258,14 +255,11 @@ pub fn geglu_backward(x: FlexTensor, grad: FlexTensor) -> [FlexTensor; 2] {
     let shape @ [_, _, f2] = dims(&x);
     let f = f2 / 2;
     let mut dx = into_values(x);
-    let sums: Vec<Vec<f32>> = dx
-        .par_chunks_mut(ROWS * f2)
-        .zip(values(&grad).par_chunks(ROWS * f))
-        .map(|(x, grad)| {
-            let mut d_bias = vec![0f32; f2];
-            geglu_rows_backward(x, grad, &mut d_bias, f);
-            d_bias
-        })
-        .collect();
-    [tensor(dx, &shape), bias(sums.into_iter(), f2)]
+    let grads = values(&grad);
+    let sums = pieces(&mut dx, shape, |_, row, x| {
+        let mut d_bias = vec![0f32; f2];
+        geglu_rows_backward(x, &grads[row * f..][..x.len() / 2], &mut d_bias, f);
+        d_bias
+    });
+    [tensor(dx, &shape), bias(sums.into_iter().flatten(), f2)]
 }
