@@ -87,6 +87,7 @@ fn norm_rows_backward(
     d_scale: &mut [f32],
 ) {
     let width = scale.len();
+    let (d_shift, d_scale) = (&mut d_shift[..width], &mut d_scale[..width]);
     let mut h = vec![0f32; width];
     for ((x, grad), dx) in x.chunks_exact(width).zip(grad.chunks_exact(width)).zip(dx.chunks_exact_mut(width)) {
         let (mean, inverse) = statistics(x);
@@ -158,6 +159,7 @@ fn gated_rows(x: &[f32], gate: &[f32], y: &[f32], out: &mut [MaybeUninit<f32>]) 
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma"))]
 fn gated_rows_backward(gate: &[f32], y: &mut [f32], grad: &[f32], d_gate: &mut [f32], d_bias: &mut [f32]) {
     let width = gate.len();
+    let (d_gate, d_bias) = (&mut d_gate[..width], &mut d_bias[..width]);
     for (y, grad) in y.chunks_exact_mut(width).zip(grad.chunks_exact(width)) {
         for i in 0..width {
             let dy = gate[i] * grad[i];
@@ -221,7 +223,8 @@ fn geglu_rows(x: &[f32], out: &mut [MaybeUninit<f32>], f: usize) {
 /// Turns `x` into its gradient, and adds to that of its bias. gelu(g) = g P(g), so gelu'(g) = P(g) + g p(g).
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma"))]
 fn geglu_rows_backward(x: &mut [f32], grad: &[f32], d_bias: &mut [f32], f: usize) {
-    let (a_bias, g_bias) = d_bias.split_at_mut(f);
+    // Lengths that the compiler knows to be the same: what is checked number by number is not computed in vectors.
+    let (a_bias, g_bias) = d_bias[..2 * f].split_at_mut(f);
     for (x, grad) in x.chunks_exact_mut(2 * f).zip(grad.chunks_exact(f)) {
         let (a, g) = x.split_at_mut(f);
         for i in 0..f {
