@@ -139,7 +139,8 @@ pub struct LossConfig {
     pub frame_jitter: FrameJitter,
 }
 
-/// How training starts from quick fits. Such batches have the input views of their fits.
+/// How training starts from quick fits. Such batches have the input views of their fits, and lead to what these should
+/// have been: [`InputFit::mended`](freerange_data::InputFit).
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StartLoss {
@@ -387,6 +388,12 @@ impl TrainConfig {
         if let Some(start) = l.start {
             check((0.0..=1.0).contains(&start.share), "loss.start.share", "0 to 1", start.share.to_string())?;
             check((0.0..1.0).contains(&start.time), "loss.start.time", "0 to below 1", start.time.to_string())?;
+            check(
+                !l.random_patches,
+                "loss.random_patches",
+                "false with loss.start, whose fits are in the tree's order",
+                "true".into(),
+            )?;
             let made = self.data.shards.is_some() || self.data.object.input_fits > 0;
             check(made, "data.object.input_fits", "at least 1 with loss.start", "0".into())?;
         }
