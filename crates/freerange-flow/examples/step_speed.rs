@@ -1,10 +1,10 @@
-//! How fast training steps are, and how much of that the matrix products alone would take.
+//! How fast training steps are, and what else they take of the machine.
 //!
 //! `cargo run --release -p freerange-flow --example step_speed -- configs/tiny.toml [steps per stage]`
 
-use std::{process::Command, time::Instant};
+use std::process::Command;
 
-use burn::tensor::{Device, Distribution, Tensor};
+use burn::tensor::Device;
 use freerange_flow::{
     config::{Stage, TrainConfig},
     trainer::Trainer,
@@ -17,8 +17,10 @@ fn main() {
     println!("machine: {}", machine());
     println!("commit: {}", output("git", &["describe", "--always", "--dirty"]));
     println!("command: {}", arguments.join(" "));
-    println!("| stage | samples/step | s/step | steps/s | waiting for data | matrix products alone | their share |");
-    println!("|---|---|---|---|---|---|---|");
+    println!(
+        "| stage | samples/step | s/step | steps/s | waiting for data | CPU s/step | of which system | page faults/step |"
+    );
+    println!("|---|---|---|---|---|---|---|---|");
     let config = TrainConfig::load(path.as_ref()).expect("a valid configuration");
     for stage in &config.stages {
         let mut one = config.clone();
@@ -31,70 +33,44 @@ fn main() {
         for _ in 0..3 {
             trainer.step().expect("a warm-up step");
         }
-        let (mut seconds, mut data, mut products) = (0.0, 0.0, 0.0);
-        // Interleaved, so that both see the same load of the machine.
+        let (mut seconds, mut data) = (0.0, 0.0);
+        let begin = usage();
         for _ in 0..steps {
             let report = trainer.step().expect("a step");
             seconds += report.seconds;
             data += report.data_seconds;
-            products += matrix_products(&config, stage, &device);
         }
         let n = steps as f64;
+        let [user, system, faults] = std::array::from_fn(|i| (usage()[i] - begin[i]) / n);
         println!(
-            "| depth {}, {} px | {} | {:.3} | {:.2} | {:.3} s | {:.3} s | {:.0} % |",
+            "| depth {}, {} px | {} | {:.3} | {:.2} | {:.3} s | {:.3} | {:.3} | {faults:.0} |",
             stage.depth,
             stage.image_size,
             stage.batch,
             seconds / n,
             n / seconds,
             data / n,
-            products / n,
-            100.0 * products / seconds
+            user + system,
+            system,
         );
     }
 }
 
-/// Seconds for the matrix products of one step: forward, and both gradients.
-fn matrix_products(config: &TrainConfig, stage: &Stage, device: &Device) -> f64 {
-    let m = &config.model;
-    let (d, f, b) = (m.hidden, m.ffn_width(), stage.batch);
-    let patches = (stage.image_size / m.encoder.patch_size()).pow(2) as usize;
-    let image = patches * config.loss.input_views.1;
-    let gaussian = (1usize << stage.depth) / m.gaussians_per_token;
-    let tokens = m.registers + image + gaussian;
-    let mut shapes = vec![
-        // times, batch, rows, inner, columns
-        (1, 1, b * image, m.image_token_width(), d),
-        (1, 1, b * gaussian, m.gaussian_channels(), d),
-        (1, 1, b * gaussian, d, m.gaussians_per_token * 14),
-    ];
-    let blocks = m.blocks;
-    shapes.extend([
-        (blocks, 1, b, d, 6 * d),
-        (blocks, 1, b * tokens, d, 3 * d),
-        (blocks, b * m.heads, tokens, d / m.heads, tokens),
-        (blocks, b * m.heads, tokens, tokens, d / m.heads),
-        (blocks, 1, b * tokens, d, d),
-        (blocks, 1, b * tokens, d, 2 * f),
-        (blocks, 1, b * tokens, f, d),
-    ]);
-    let mut seconds = 0.0;
-    for (times, batch, rows, inner, columns) in shapes {
-        let random = |a, b| Tensor::<3>::random([batch, a, b], Distribution::Default, device);
-        let (x, w, y) = (random(rows, inner), random(inner, columns), random(rows, columns));
-        let begin = Instant::now();
-        for _ in 0..times {
-            let forward = x.clone().matmul(w.clone());
-            let to_input = y.clone().matmul(w.clone().swap_dims(1, 2));
-            let to_weight = x.clone().swap_dims(1, 2).matmul(y.clone());
-            // Reading one value waits for the product on any device.
-            for t in [forward, to_input, to_weight] {
-                let _: f32 = t.slice([0..1, 0..1, 0..1]).into_scalar();
-            }
-        }
-        seconds += begin.elapsed().as_secs_f64();
-    }
-    seconds
+/// Seconds of user and of system time that this process has taken with all its threads, and its minor page faults.
+#[cfg(unix)]
+fn usage() -> [f64; 3] {
+    // SAFETY: plain numbers, of which zeros are valid.
+    let mut usage: libc::rusage = unsafe { std::mem::zeroed() };
+    // SAFETY: `usage` is ours to be written.
+    unsafe { libc::getrusage(libc::RUSAGE_SELF, &raw mut usage) };
+    let seconds = |t: libc::timeval| t.tv_sec as f64 + t.tv_usec as f64 * 1e-6;
+    [seconds(usage.ru_utime), seconds(usage.ru_stime), usage.ru_minflt as f64]
+}
+
+/// Unknown.
+#[cfg(not(unix))]
+fn usage() -> [f64; 3] {
+    [f64::NAN; 3]
 }
 
 fn machine() -> String {

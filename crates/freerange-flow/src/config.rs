@@ -200,6 +200,8 @@ pub struct OptimizerConfig {
     pub warmup: u64,
     /// Decoupled weight decay.
     pub weight_decay: f32,
+    /// What it applies to.
+    pub decay: Decay,
     /// First and second moment decay.
     pub betas: (f32, f32),
     /// Largest joint norm of the gradients.
@@ -221,6 +223,7 @@ impl Default for OptimizerConfig {
             schedule: RateSchedule::Cosine,
             warmup: 2000,
             weight_decay: 0.01,
+            decay: Decay::All,
             betas: (0.9, 0.95),
             clip: 1.0,
             ema: 0.9999,
@@ -228,6 +231,17 @@ impl Default for OptimizerConfig {
             recompute: false,
         }
     }
+}
+
+/// Which parameters decay.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Decay {
+    /// All.
+    #[default]
+    All,
+    /// Those of two axes or more: neither biases nor factors of norms.
+    Matrices,
 }
 
 /// How the learning rate falls after the warm-up.

@@ -8,6 +8,7 @@ pub mod coupling;
 mod error;
 mod inherit;
 pub mod log;
+mod optimizer;
 pub mod path;
 pub mod photometric;
 pub mod sample;

@@ -9,7 +9,6 @@ use std::{
 
 use burn::{
     module::Module,
-    optim::{AdamWConfig, GradientsParams, ModuleOptimizer},
     store::ModuleRecord,
     tensor::{Device, Tensor},
 };
@@ -22,9 +21,10 @@ use crate::{
     FlowError,
     batch::{Batch, step_rng},
     config::TrainConfig,
+    optimizer::{AdamW, Flat, Step},
     photometric::Photometric,
     train,
-    weights::{Weights, global_norm, scale},
+    weights::Weights,
 };
 
 /// Decay of the running mean square of the photometric gradient.
@@ -94,10 +94,10 @@ pub struct Initial<'a> {
 /// A training run in memory.
 pub struct Trainer {
     config: TrainConfig,
-    device: Device, // the plain one
-    model: FreeRange,
+    device: Device,           // the plain one
+    model: Option<FreeRange>, // none only while the optimiser changes it
     average: Weights,
-    optimizer: ModuleOptimizer,
+    optimizer: AdamW,
     progress: Progress,
     photometric: Photometric,
     stream: Stream,
@@ -143,16 +143,8 @@ impl Trainer {
         let mut model = FreeRange::new(&config.model, &mut step_rng(config.seed, u64::MAX), &tracked)?
             .with_compute(config.optimizer.compute)
             .with_recompute(config.optimizer.recompute);
-        let o = &config.optimizer;
-        let mut optimizer = AdamWConfig::new()
-            .with_weight_decay(o.weight_decay)
-            .with_beta_1(o.betas.0)
-            .with_beta_2(o.betas.1)
-            .with_epsilon(1e-8)
-            .init();
-
         let saved = latest_state(folder)?;
-        let (state, average) = match &saved {
+        let (state, average, optimizer) = match &saved {
             Some(path) => {
                 progress(&format!("continuing from {}", path.display()));
                 let state = |name: &str| path.join(name);
@@ -162,13 +154,14 @@ impl Trainer {
                 let average =
                     average.try_load_record(record("average")?).map_err(|e| broken("average", e.to_string()))?;
                 model = model.try_load_record(record("model")?).map_err(|e| broken("model", e.to_string()))?;
-                optimizer = optimizer.load(state("optimizer")).map_err(|e| broken("optimizer", e.to_string()))?;
+                let average = Weights::of(&average);
+                let optimizer = AdamW::load(&state("optimizer.safetensors"), &average, &plain)?;
                 let file = state("progress.json");
                 let text =
                     std::fs::read_to_string(&file).map_err(|source| FlowError::Io { path: file.clone(), source })?;
                 let progress = serde_json::from_str::<Progress>(&text)
                     .map_err(|e| FlowError::State { path: file, problem: e.to_string() })?;
-                (progress, Weights::of(&average))
+                (progress, average, optimizer)
             }
             None => {
                 if let Some(Initial { checkpoint, .. }) = initial {
@@ -202,7 +195,9 @@ impl Trainer {
                     broken: 0,
                     skipped: 0,
                 };
-                (state, Weights::of(&model))
+                let average = Weights::of(&model);
+                let optimizer = AdamW::new(average.0.len());
+                (state, average, optimizer)
             }
         };
 
@@ -215,7 +210,7 @@ impl Trainer {
             photometric: Photometric::new(&state.normalization, &plain),
             config,
             device: plain,
-            model,
+            model: Some(model),
             average,
             optimizer,
             broken: state.broken,
@@ -236,6 +231,10 @@ impl Trainer {
     /// The configuration of the run.
     pub fn config(&self) -> &TrainConfig {
         &self.config
+    }
+
+    fn model(&self) -> &FreeRange {
+        self.model.as_ref().expect("a step gives it back")
     }
 
     /// The batch of step `index`, which must be the first or follow the one before.
@@ -274,9 +273,9 @@ impl Trainer {
         let mut data_seconds = begin.elapsed().as_secs_f64();
 
         let rms = Tensor::<1>::from_floats(self.gradient_rms(), &self.device).reshape([1, 1, channel::COUNT]);
-        let losses = train::step(&self.model, batch, &self.photometric, &rms, &self.config.loss, &self.device)?;
-        let mut gradients = GradientsParams::from_grads(losses.total.clone().backward(), &self.model);
-        let norm = global_norm(&gradients, &self.model, &self.device);
+        let losses = train::step(self.model(), batch, &self.photometric, &rms, &self.config.loss, &self.device)?;
+        let mut gradients = Flat::of(&mut losses.total.clone().backward(), self.model());
+        let norm = gradients.norm(&self.device);
         let first_object = self.window.front().map(|(number, _)| *number);
         // A GPU has only been told by now what to do: the next batch is made while it works.
         if index + 1 < self.config.total_steps() {
@@ -289,14 +288,20 @@ impl Trainer {
         figures.extend(losses.gradient_square);
         let figures = Tensor::cat(figures, 0).into_data().try_to_vec::<f32>().map_err(|_| FlowError::NoGradient)?;
         let (&[total, flow, seen, held, norm], square) = figures.split_first_chunk().ok_or(FlowError::NoGradient)?;
-        let rate = self.config.optimizer.rate(index, self.config.total_steps());
+        let o = &self.config.optimizer;
+        let rate = o.rate(index, self.config.total_steps());
         let finite = figures.iter().all(|x| x.is_finite());
         if finite {
-            let clip = self.config.optimizer.clip;
-            if norm > clip {
-                scale(&mut gradients, &self.model, clip / norm);
-            }
-            self.model = self.optimizer.step(rate, self.model.clone(), gradients);
+            let applied = self.progress.step - self.progress.skipped;
+            let step = Step {
+                time: applied + 1,
+                rate,
+                clip: if norm > o.clip { o.clip / norm } else { 1.0 },
+                // The average follows closely at first, when the weights still move far.
+                ema: o.ema.min((1.0 + applied as f32) / (10.0 + applied as f32)),
+            };
+            let model = self.model.take().expect("a step gives it back");
+            self.model = Some(self.optimizer.step(model, gradients, &mut self.average, o, step));
             self.follow(square);
         }
         let seconds = begin.elapsed().as_secs_f64();
@@ -329,9 +334,6 @@ impl Trainer {
     /// Moves the averages after a step that was applied. `square`: the mean square of the gradient's channels in it.
     fn follow(&mut self, square: &[f32]) {
         let applied = (self.progress.step - self.progress.skipped) as f32;
-        // The average follows closely at first, when the weights still move far.
-        let decay = self.config.optimizer.ema.min((1.0 + applied) / (10.0 + applied));
-        self.average.average(&Weights::of(&self.model), decay);
         // The mean of all steps so far until that is long enough to forget the oldest. What an initial checkpoint knows
         // is worth as much from the start.
         let decay = match self.progress.inherited {
@@ -364,12 +366,12 @@ impl Trainer {
         std::fs::create_dir_all(&partial).map_err(io(&partial))?;
         let broken = |name: &str, e: String| FlowError::State { path: partial.join(name), problem: e };
         // Sampling chooses its own arithmetic.
-        let average = self.average.apply(self.model.clone().valid()).with_compute(Compute::F32).with_recompute(false);
-        let model = self.model.clone().into_record();
+        let average = self.average.apply(self.model().clone().valid()).with_compute(Compute::F32).with_recompute(false);
+        let model = self.model().clone().into_record();
         model.save(partial.join("model")).map_err(|e| broken("model", e.to_string()))?;
         let record = average.clone().into_record();
         record.save(partial.join("average")).map_err(|e| broken("average", e.to_string()))?;
-        self.optimizer.save(partial.join("optimizer")).map_err(|e| broken("optimizer", e.to_string()))?;
+        self.optimizer.save(&partial.join("optimizer.safetensors"))?;
         let file = partial.join("progress.json");
         let text = serde_json::to_string_pretty(&self.progress).expect("plain numbers");
         std::fs::write(&file, text).map_err(io(&file))?;

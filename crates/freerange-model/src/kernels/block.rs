@@ -1,7 +1,7 @@
 //! A whole transformer block, forward and backward, from the operations of [`Kernels`].
 //!
 //! One operation instead of nine lets the backward pass start from the block's input alone (gradient checkpointing),
-//! lets biases be added where their products are read, and writes the six parts of the modulation's gradient once.
+//! lets biases be added where their products are read (and have their gradients from there), and writes the six parts of the modulation's gradient once.
 
 use burn::{
     backend::{Backend, ExtensionType, TensorMetadata, tensor::FloatTensor},
@@ -151,42 +151,36 @@ pub(crate) fn backward<B: Kernels>(
 ) -> (FloatTensor<B>, FloatTensor<B>, Weights<B>) {
     let BlockSettings { heads, queries, compute, .. } = settings;
     let m = |i: usize| part::<B>(modulation, i, 6);
-    // A bias has its gradient from where it was added.
-    let bias = |here: Option<FloatTensor<B>>, there: Option<FloatTensor<B>>| here.or(there).expect("added somewhere");
+    let bias = |gradient: Option<FloatTensor<B>>| gradient.expect("all products have a bias");
 
-    let ([d_gate_f, d_fed], at_gate) = B::gated_add_backward(m(5), saved.fed, grad.clone());
-    let (d_hidden, d_down, at_product) = B::product_backward(saved.hidden, w.down.clone(), d_fed, compute);
-    let d_down_bias = bias(at_gate, at_product);
-    let (d_inner, at_geglu) = B::geglu_backward(saved.inner, d_hidden);
-    let (d_normed_f, d_in, at_product) = B::product_backward(saved.normed_f, w.inner.clone(), d_inner, compute);
-    let d_in_bias = bias(at_geglu, at_product);
-    let [d_middle, d_shift_f, d_scale_f] = B::modulated_norm_backward(saved.middle, m(4), d_normed_f);
-    let d_middle = B::float_add(grad, d_middle);
+    let ([d_gate_f, d_fed], d_down_bias) = B::gated_add_backward(m(5), saved.fed, grad.clone());
+    let [d_hidden, d_down] = B::product_backward(saved.hidden, w.down.clone(), d_fed, compute);
+    let (d_inner, d_in_bias) = B::geglu_backward(saved.inner, d_hidden);
+    let [d_normed_f, d_in] = B::product_backward(saved.normed_f, w.inner.clone(), d_inner, compute);
+    let [d_middle, d_shift_f, d_scale_f] =
+        B::modulated_norm_and_residual_backward(saved.middle, m(4), d_normed_f, grad);
 
-    let ([d_gate_a, d_attended], at_gate) = B::gated_add_backward(m(2), saved.attended, d_middle.clone());
-    let (d_mixed, d_out, at_product) = B::product_backward(saved.mixed.clone(), w.out.clone(), d_attended, compute);
-    let d_out_bias = bias(at_gate, at_product);
+    let ([d_gate_a, d_attended], d_out_bias) = B::gated_add_backward(m(2), saved.attended, d_middle.clone());
+    let [d_mixed, d_out] = B::product_backward(saved.mixed.clone(), w.out.clone(), d_attended, compute);
     let norms = Some([w.q_norm.clone(), w.k_norm.clone()]);
     let d = B::attention_backward(saved.qkv, norms, saved.mixed, saved.log_sum, d_mixed, heads, compute);
-    let (d_normed_a, d_qkv, at_product) = B::product_backward(saved.normed_a, w.qkv.clone(), d.qkv, compute);
-    let d_qkv_bias = bias(d.bias, at_product);
+    let [d_normed_a, d_qkv] = B::product_backward(saved.normed_a, w.qkv.clone(), d.qkv, compute);
     let [d_q_norm, d_k_norm] = d.norms.expect("there were norms");
-    let shape = x.shape();
-    let [dx, d_shift_a, d_scale_a] = B::modulated_norm_backward(x, m(1), d_normed_a);
-    let dx = B::float_add(dx, first_padded::<B>(d_middle, shape, queries));
+    let residual = first_padded::<B>(d_middle, x.shape(), queries);
+    let [dx, d_shift_a, d_scale_a] = B::modulated_norm_and_residual_backward(x, m(1), d_normed_a, residual);
 
     let dm = B::float_cat(vec![d_shift_a, d_scale_a, d_gate_a, d_shift_f, d_scale_f, d_gate_f], 1);
     let dw = Weights {
         qkv: d_qkv,
-        qkv_bias: d_qkv_bias,
+        qkv_bias: bias(d.bias),
         q_norm: d_q_norm,
         k_norm: d_k_norm,
         out: d_out,
-        out_bias: d_out_bias,
+        out_bias: bias(d_out_bias),
         inner: d_in,
-        inner_bias: d_in_bias,
+        inner_bias: bias(d_in_bias),
         down: d_down,
-        down_bias: d_down_bias,
+        down_bias: bias(d_down_bias),
     };
     (dx, dm, dw)
 }

@@ -28,7 +28,7 @@ pub(crate) type Product<B> = (FloatTensor<B>, Option<FloatTensor<B>>);
 pub(crate) struct AttentionGrads<B: Backend> {
     /// `[b, t, 3 d]`
     pub qkv: FloatTensor<B>,
-    /// `[3 d]`, if there was a bias.
+    /// `[3 d]`, as of [`Kernels::gated_add_backward`].
     pub bias: Option<FloatTensor<B>>,
     /// Both `[width]`, if there were norms.
     pub norms: Option<Grads<B, 2>>,
@@ -61,13 +61,13 @@ pub(crate) trait Kernels: Backend {
         b: FloatTensor<Self>,
         compute: Compute,
     ) -> Product<Self>;
-    /// Gradients of `x`, `w`, and of the bias if the product had it added.
+    /// Gradients of `x` and `w`; that of the bias comes from the product's reader.
     fn product_backward(
         x: FloatTensor<Self>,
         w: FloatTensor<Self>,
         grad: FloatTensor<Self>,
         compute: Compute,
-    ) -> (FloatTensor<Self>, FloatTensor<Self>, Option<FloatTensor<Self>>);
+    ) -> Grads<Self, 2>;
 
     fn modulated_norm_forward(
         x: FloatTensor<Self>,
@@ -82,8 +82,20 @@ pub(crate) trait Kernels: Backend {
         grad: FloatTensor<Self>,
     ) -> Grads<Self, 3>;
 
+    /// The same for an `x` that is also added to something later: its gradient from there is `residual`.
+    fn modulated_norm_and_residual_backward(
+        x: FloatTensor<Self>,
+        scale: FloatTensor<Self>,
+        grad: FloatTensor<Self>,
+        residual: FloatTensor<Self>,
+    ) -> Grads<Self, 3> {
+        let [dx, d_shift, d_scale] = Self::modulated_norm_backward(x, scale, grad);
+        [Self::float_add(residual, dx), d_shift, d_scale]
+    }
+
     fn gated_add_forward(x: FloatTensor<Self>, gate: FloatTensor<Self>, y: Product<Self>) -> FloatTensor<Self>;
-    /// Gradients of `gate`, `y` and its bias; that of `x` is `grad` itself.
+    /// Gradients of `gate`, `y` and its bias (on a CPU always, on others if it was to be added); that of `x` is `grad`
+    /// itself.
     fn gated_add_backward(
         gate: FloatTensor<Self>,
         y: Product<Self>,
@@ -91,7 +103,7 @@ pub(crate) trait Kernels: Backend {
     ) -> (Grads<Self, 2>, Option<FloatTensor<Self>>);
 
     fn geglu_forward(x: Product<Self>) -> FloatTensor<Self>;
-    /// Gradients of `x` and its bias.
+    /// Gradients of `x` and its bias, as there.
     fn geglu_backward(x: Product<Self>, grad: FloatTensor<Self>) -> Product<Self>;
 
     /// The mixed values `[b, queries, d]` and, if `keep`, the log of each softmax's denominator `[b, heads, queries]`.

@@ -190,7 +190,7 @@ pub fn forward(
     let d = sizes.d();
     assert!(d * 3 == d3 && queries <= tokens, "attention: heads and queries fit the tokens");
     let (xs, weights) = (values(&qkv), norms.as_ref().map(weights));
-    let mut out = vec![0f32; b * queries * d];
+    let mut out = Vec::with_capacity(b * queries * d);
     let mut log_sum = vec![0f32; b * heads * queries];
     let target = Shared(out.as_mut_ptr());
     let (head_forward, _) = by_head(bf16);
@@ -203,6 +203,8 @@ pub fn forward(
             head_forward(rows, weights, sizes, head, out, log_sum);
         }
     });
+    // SAFETY: every head of every image has written its columns of all rows.
+    unsafe { out.set_len(b * queries * d) };
     (tensor(out, &[b, queries, d]), tensor(log_sum, &[b, heads, queries]))
 }
 
@@ -261,7 +263,8 @@ pub fn backward(
     let sizes = Sizes { tokens, queries, heads, width: d / heads };
     let (xs, weights) = (values(&qkv), norms.as_ref().map(weights));
     let (outs, log_sums, grads) = (values(&out), values(&log_sum), values(&grad));
-    let mut d_qkv = vec![0f32; xs.len()];
+    // Queries that are not asked for have no gradient; all else is written.
+    let mut d_qkv = if queries == tokens { Vec::with_capacity(xs.len()) } else { vec![0f32; xs.len()] };
     let target = Shared(d_qkv.as_mut_ptr());
     let (_, head_backward) = by_head(bf16);
     let d_weights: Vec<_> = (0..b * heads)
@@ -278,6 +281,8 @@ pub fn backward(
             unsafe { head_backward(saved, weights, sizes, head, target.at(batch * tokens * d3)) }
         })
         .collect();
+    // SAFETY: every head of every image has written its columns of all rows.
+    unsafe { d_qkv.set_len(xs.len()) };
     let (mut d_wq, mut d_wk) = (vec![0f32; sizes.width], vec![0f32; sizes.width]);
     for (wq, wk) in &d_weights {
         math::add(&mut d_wq, wq);

@@ -2,6 +2,7 @@
 
 use burn::backend::flex::FlexTensor;
 use gemm::Parallelism;
+use multiversion::multiversion;
 use rayon::prelude::*;
 
 #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
@@ -81,14 +82,23 @@ pub unsafe fn matmul(
 
 /// Below this many multiplications, starting threads costs more than it saves.
 fn parallelism(shape: [usize; 3]) -> Parallelism {
-    if shape.iter().product::<usize>() < 1 << 22 { Parallelism::None } else { Parallelism::Rayon(0) }
+    if shape.iter().product::<usize>() < 1 << 20 { Parallelism::None } else { Parallelism::Rayon(0) }
 }
 
 /// `bias + a b`, with the bias added to every row; in bf16 where asked for and the CPU can.
-fn product(shape @ [m, _, n]: [usize; 3], a: Matrix, b: Matrix, bias: Option<&[f32]>, in_bf16: bool) -> Vec<f32> {
+fn product(shape @ [m, k, n]: [usize; 3], a: Matrix, b: Matrix, bias: Option<&[f32]>, in_bf16: bool) -> Vec<f32> {
     #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
     if in_bf16 && amx::available() {
         return amx::product(shape, a, b, bias);
+    }
+    if bias.is_none() && k > 0 && !(in_bf16 && bf16::available()) {
+        let mut out = Vec::with_capacity(m * n);
+        // SAFETY: `out` has room for m rows of n values, all of which are written.
+        unsafe {
+            matmul(shape, a, b, 1.0, out.as_mut_ptr(), n, false, parallelism(shape));
+            out.set_len(m * n);
+        }
+        return out;
     }
     let mut out = vec![0f32; m * n];
     if let Some(bias) = bias {
@@ -130,7 +140,7 @@ pub fn backward(
     grad: FlexTensor,
     need_x: bool,
     bf16: bool,
-) -> (Option<FlexTensor>, FlexTensor, FlexTensor) {
+) -> (Option<FlexTensor>, FlexTensor) {
     let (x, w, grad) = (contiguous(x), contiguous(w), contiguous(grad));
     let [outputs, inputs] = dims(&w);
     let rows = values(&x).len() / inputs;
@@ -140,21 +150,21 @@ pub fn backward(
         tensor(dx, &x.layout().shape().to_vec())
     });
     let dw = product([outputs, rows, inputs], g.transposed(), Matrix::rows(values(&x), inputs), None, bf16);
-    let db = column_sums(values(&grad), outputs);
-    (dx, tensor(dw, &[outputs, inputs]), tensor(db, &[outputs]))
+    (dx, tensor(dw, &[outputs, inputs]))
 }
 
-/// Sums over the rows of `[rows, width]`.
-fn column_sums(data: &[f32], width: usize) -> Vec<f32> {
-    let partial: Vec<Vec<f32>> = data
-        .par_chunks(ROWS * width)
-        .map(|piece| {
-            let mut sums = vec![0f32; width];
-            piece.chunks_exact(width).for_each(|row| math::add(&mut sums, row));
-            sums
-        })
-        .collect();
+/// The gradient of a bias: sums over the rows of `[..., width]`.
+pub fn bias(grad: &FlexTensor) -> FlexTensor {
+    #[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma"))]
+    fn sums(rows: &[f32], width: usize) -> Vec<f32> {
+        let mut sums = vec![0f32; width];
+        rows.chunks_exact(width).for_each(|row| math::add(&mut sums, row));
+        sums
+    }
+    let grad = contiguous(grad.clone());
+    let width = *grad.layout().shape().to_vec().last().expect("has axes");
+    let pieces: Vec<Vec<f32>> = values(&grad).par_chunks(ROWS * width).map(|rows| sums(rows, width)).collect();
     let mut total = vec![0f32; width];
-    partial.iter().for_each(|p| math::add(&mut total, p));
-    total
+    pieces.iter().for_each(|piece| math::add(&mut total, piece));
+    tensor(total, &[width])
 }

@@ -49,6 +49,12 @@ fn values(t: &FlexTensor) -> &[f32] {
     t.as_slice::<f32>().expect("contiguous f32")
 }
 
+/// The values of a tensor in the order of its axes; those of which there is no other tensor are not copied.
+fn into_values(t: FlexTensor) -> Vec<f32> {
+    assert_eq!(t.dtype(), DType::F32, "the CPU computes in f32");
+    t.into_data().try_into_vec().expect("f32")
+}
+
 fn tensor(values: Vec<f32>, shape: &[usize]) -> FlexTensor {
     FlexTensor::from_data(TensorData::new(values, shape.to_vec()))
 }
@@ -75,21 +81,18 @@ impl Kernels for Flex {
         need_x: bool,
         compute: Compute,
     ) -> (Option<FlexTensor>, FlexTensor, FlexTensor) {
-        linear::backward(x, w, grad, need_x, compute == Compute::Bf16)
+        let db = linear::bias(&grad);
+        let (dx, dw) = linear::backward(x, w, grad, need_x, compute == Compute::Bf16);
+        (dx, dw, db)
     }
 
     fn product_forward(x: FlexTensor, w: FlexTensor, b: FlexTensor, compute: Compute) -> Product<Self> {
         (Self::linear_forward(x, w, b, compute), None)
     }
 
-    fn product_backward(
-        x: FlexTensor,
-        w: FlexTensor,
-        grad: FlexTensor,
-        compute: Compute,
-    ) -> (FlexTensor, FlexTensor, Option<FlexTensor>) {
-        let (dx, dw, db) = Self::linear_backward(x, w, grad, true, compute);
-        (dx.expect("asked for"), dw, Some(db))
+    fn product_backward(x: FlexTensor, w: FlexTensor, grad: FlexTensor, compute: Compute) -> Grads<Self, 2> {
+        let (dx, dw) = linear::backward(x, w, grad, true, compute == Compute::Bf16);
+        [dx.expect("asked for"), dw]
     }
 
     fn modulated_norm_forward(x: FlexTensor, shift: FlexTensor, scale: FlexTensor, _: Compute) -> FlexTensor {
@@ -97,7 +100,16 @@ impl Kernels for Flex {
     }
 
     fn modulated_norm_backward(x: FlexTensor, scale: FlexTensor, grad: FlexTensor) -> Grads<Self, 3> {
-        pointwise::modulated_norm_backward(x, scale, grad)
+        pointwise::modulated_norm_backward(x, scale, grad, None)
+    }
+
+    fn modulated_norm_and_residual_backward(
+        x: FlexTensor,
+        scale: FlexTensor,
+        grad: FlexTensor,
+        residual: FlexTensor,
+    ) -> Grads<Self, 3> {
+        pointwise::modulated_norm_backward(x, scale, grad, Some(residual))
     }
 
     fn gated_add_forward(x: FlexTensor, gate: FlexTensor, y: Product<Self>) -> FlexTensor {
@@ -109,7 +121,8 @@ impl Kernels for Flex {
         y: Product<Self>,
         grad: FlexTensor,
     ) -> (Grads<Self, 2>, Option<FlexTensor>) {
-        (pointwise::gated_add_backward(gate, complete(y), grad), None)
+        let [d_gate, dy, d_bias] = pointwise::gated_add_backward(gate, complete(y), grad);
+        ([d_gate, dy], Some(d_bias))
     }
 
     fn geglu_forward(x: Product<Self>) -> FlexTensor {
@@ -117,7 +130,8 @@ impl Kernels for Flex {
     }
 
     fn geglu_backward(x: Product<Self>, grad: FlexTensor) -> Product<Self> {
-        (pointwise::geglu_backward(complete(x), grad), None)
+        let [dx, d_bias] = pointwise::geglu_backward(complete(x), grad);
+        (dx, Some(d_bias))
     }
 
     fn attention_forward(
@@ -143,6 +157,6 @@ impl Kernels for Flex {
     ) -> AttentionGrads<Self> {
         let bf16 = compute == Compute::Bf16;
         let (qkv, norms) = attention::backward(complete(qkv), norms, out, log_sum, grad, heads, bf16);
-        AttentionGrads { qkv, bias: None, norms }
+        AttentionGrads { bias: Some(linear::bias(&qkv)), qkv, norms }
     }
 }

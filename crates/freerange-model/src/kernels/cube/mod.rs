@@ -138,14 +138,9 @@ impl Kernels for CubeBackend {
         (linear::product(x, w, compute), Some(b))
     }
 
-    fn product_backward(
-        x: CubeTensor,
-        w: CubeTensor,
-        grad: CubeTensor,
-        compute: Compute,
-    ) -> (CubeTensor, CubeTensor, Option<CubeTensor>) {
+    fn product_backward(x: CubeTensor, w: CubeTensor, grad: CubeTensor, compute: Compute) -> Grads<Self, 2> {
         let (dx, dw) = linear::backward(x, w, grad, true, compute);
-        (dx.expect("asked for"), dw, None)
+        [dx.expect("asked for"), dw]
     }
 
     fn modulated_norm_forward(x: CubeTensor, shift: CubeTensor, scale: CubeTensor, compute: Compute) -> CubeTensor {

@@ -1,0 +1,455 @@
+//! AdamW (Loshchilov and Hutter 2019), the joint norm of gradients, and the moving average of the weights.
+//!
+//! On the CPU everything that happens to a parameter in a step happens in one pass over memory: passes are what an
+//! optimiser costs.
+
+use std::path::Path;
+
+use burn::{
+    module::{Module, ModuleMapper, ModuleVisitor, Param},
+    tensor::{Device, Gradients, Tensor, TensorData},
+};
+use multiversion::multiversion;
+use rayon::prelude::*;
+use safetensors::{Dtype, SafeTensors, tensor::TensorView};
+
+use crate::{
+    FlowError,
+    config::{Decay, OptimizerConfig},
+    weights::Weights,
+};
+
+/// What is added to the root of the second moment.
+const EPSILON: f32 = 1e-8;
+/// Numbers per piece of work; fixed, so that sums do not depend on the number of threads.
+const PIECE: usize = 1 << 14;
+
+/// The gradient of each of a module's parameters in the order in which the module visits them, flat; none where none
+/// reached it.
+pub(crate) struct Flat(Vec<Option<Tensor<1>>>);
+
+impl Flat {
+    pub fn of<M: Module>(gradients: &mut Gradients, module: &M) -> Self {
+        struct Collect<'a>(&'a mut Gradients, Vec<Option<Tensor<1>>>);
+        impl ModuleVisitor for Collect<'_> {
+            fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+                let gradient = param.val().grad_remove(self.0);
+                self.1.push(gradient.map(|g| {
+                    let len = g.shape().num_elements();
+                    g.reshape([len])
+                }));
+            }
+        }
+        let mut collect = Collect(gradients, Vec::new());
+        module.visit(&mut collect);
+        Self(collect.1)
+    }
+
+    /// The joint Euclidean norm. `[1]`, on the device.
+    pub fn norm(&mut self, device: &Device) -> Tensor<1> {
+        let gradients = self.0.iter_mut().flatten();
+        if !is_cpu(device) {
+            return gradients.fold(Tensor::zeros([1], device), |sum, g| sum + g.clone().square().sum()).sqrt();
+        }
+        let mut sum = 0f64;
+        for g in gradients {
+            let data = take(g);
+            sum += square_sum(data.as_slice().expect("f32"));
+            *g = Tensor::from_data(data, device);
+        }
+        Tensor::from_floats([sum.sqrt() as f32], device)
+    }
+}
+
+fn is_cpu(device: &Device) -> bool {
+    *device == Device::flex()
+}
+
+/// The values of a tensor on the CPU, which are moved and not copied if no other tensor has them.
+fn take(t: &mut Tensor<1>) -> TensorData {
+    let device = t.device();
+    std::mem::replace(t, Tensor::empty([0], &device)).into_data()
+}
+
+/// The optimiser's state.
+pub(crate) struct AdamW {
+    moments: Vec<Option<[Tensor<1>; 2]>>, // as in `Flat`; none of parameters that never had a gradient
+}
+
+/// What a step needs to know besides the gradients.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Step {
+    /// Its number, from 1.
+    pub time: u64,
+    pub rate: f64,
+    /// What gradients are multiplied by first.
+    pub clip: f32,
+    /// Of the average of the weights.
+    pub ema: f32,
+}
+
+/// A step's numbers for one parameter.
+#[derive(Clone, Copy)]
+struct Factors {
+    clip: f32,
+    betas: [f32; 2],
+    /// What weights keep.
+    keep: f32,
+    /// Of the first moment, its correction included.
+    rate: f32,
+    /// Of the second moment's root: its correction.
+    root: f32,
+    ema: f32,
+}
+
+impl Factors {
+    fn new(config: &OptimizerConfig, step: Step, rank: usize) -> Self {
+        let betas = [config.betas.0, config.betas.1];
+        // Moments start at zero, and are short by this at first.
+        let [first, second] = betas.map(|beta| 1.0 - f64::from(beta).powf(step.time as f64));
+        let decayed = config.decay == Decay::All || rank >= 2;
+        let decay = if decayed { f64::from(config.weight_decay) } else { 0.0 };
+        Self {
+            clip: step.clip,
+            betas,
+            keep: (1.0 - step.rate * decay) as f32,
+            rate: (step.rate / first) as f32,
+            root: second.sqrt().recip() as f32,
+            ema: step.ema,
+        }
+    }
+}
+
+impl AdamW {
+    /// For a module of so many parameters.
+    pub fn new(parameters: usize) -> Self {
+        Self { moments: vec![None; parameters] }
+    }
+
+    /// The module after a step, which `average` follows. A module of which there is no other copy is changed in place.
+    pub fn step<M: Module>(
+        &mut self,
+        module: M,
+        gradients: Flat,
+        average: &mut Weights,
+        config: &OptimizerConfig,
+        step: Step,
+    ) -> M {
+        struct Update<'a, I>(I, &'a OptimizerConfig, Step);
+        impl<'a, I> ModuleMapper for Update<'_, I>
+        where
+            I: Iterator<Item = ((&'a mut Option<[Tensor<1>; 2]>, &'a mut Tensor<1>), Option<Tensor<1>>)>,
+        {
+            fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+                let ((moments, average), gradient) = self.0.next().expect("as many as parameters");
+                let Some(gradient) = gradient else {
+                    let weights = param.val().inner();
+                    let len = weights.shape().num_elements();
+                    follow(average, weights.reshape([len]), self.2.ema);
+                    return param;
+                };
+                let factors = Factors::new(self.1, self.2, D);
+                param.map(|old| {
+                    let (shape, tracked) = (old.shape(), old.is_require_grad());
+                    let weights = old.inner().reshape([shape.num_elements()]);
+                    let moments = moments.get_or_insert_with(|| [weights.zeros_like(), weights.zeros_like()]);
+                    let update = if is_cpu(&weights.device()) { update_in_place } else { update };
+                    let new = update(weights, moments, average, gradient, &factors);
+                    new.reshape(shape).autodiff().set_require_grad(tracked)
+                })
+            }
+        }
+        let parameters = self.moments.iter_mut().zip(&mut average.0).zip(gradients.0);
+        module.map(&mut Update(parameters, config, step))
+    }
+
+    /// # Errors
+    /// [`FlowError::State`].
+    pub fn save(&self, path: &Path) -> Result<(), FlowError> {
+        let broken = |problem: String| FlowError::State { path: path.into(), problem };
+        let stored: Vec<(String, TensorData)> = self
+            .moments
+            .iter()
+            .enumerate()
+            .filter_map(|(i, moments)| Some((i, moments.as_ref()?)))
+            .flat_map(|(i, moments)| moments.iter().enumerate().map(move |(j, m)| (format!("{i}.{j}"), m.to_data())))
+            .collect();
+        let views = stored.iter().map(|(name, data)| {
+            let view = TensorView::new(Dtype::F32, data.shape().to_vec(), data.as_bytes());
+            (name, view.expect("as many bytes as numbers"))
+        });
+        safetensors::serialize_to_file(views, None, path).map_err(|e| broken(e.to_string()))
+    }
+
+    /// The state that [`save`](Self::save) wrote, for these weights.
+    ///
+    /// # Errors
+    /// [`FlowError::State`], [`FlowError::Io`].
+    pub fn load(path: &Path, weights: &Weights, device: &Device) -> Result<Self, FlowError> {
+        let broken = |problem: String| FlowError::State { path: path.into(), problem };
+        let bytes = std::fs::read(path).map_err(|source| FlowError::Io { path: path.into(), source })?;
+        let file = SafeTensors::deserialize(&bytes).map_err(|e| broken(e.to_string()))?;
+        let read = |name: String, len: usize| match file.tensor(&name) {
+            Ok(t) if t.dtype() == Dtype::F32 && t.shape() == [len] => {
+                let values = t.data().as_chunks::<4>().0.iter().map(|x| f32::from_le_bytes(*x)).collect::<Vec<_>>();
+                Ok(Tensor::from_data(TensorData::new(values, [len]), device))
+            }
+            Ok(t) => {
+                Err(broken(format!("tensor `{name}`: expected {len} of F32, found {:?} {:?}", t.shape(), t.dtype())))
+            }
+            Err(e) => Err(broken(format!("tensor `{name}`: {e}"))),
+        };
+        let moments = weights.0.iter().enumerate().map(|(i, w)| {
+            if file.tensor(&format!("{i}.0")).is_err() {
+                return Ok(None);
+            }
+            let len = w.dims()[0];
+            Ok(Some([read(format!("{i}.0"), len)?, read(format!("{i}.1"), len)?]))
+        });
+        Ok(Self { moments: moments.collect::<Result<_, FlowError>>()? })
+    }
+}
+
+/// New weights; moments and average move along. With the CPU's tensors, in place.
+fn update_in_place(
+    weights: Tensor<1>,
+    moments: &mut [Tensor<1>; 2],
+    average: &mut Tensor<1>,
+    gradient: Tensor<1>,
+    f: &Factors,
+) -> Tensor<1> {
+    let device = weights.device();
+    let (mut weights, gradient) = (weights.into_data(), gradient.into_data());
+    let [first, second] = moments;
+    let mut state = [&mut *first, &mut *second, &mut *average].map(take);
+    {
+        fn numbers(data: &mut TensorData) -> rayon::slice::ChunksMut<'_, f32> {
+            data.as_mut_slice::<f32>().expect("f32").par_chunks_mut(PIECE)
+        }
+        let [m, v, e] = state.each_mut().map(numbers);
+        let g = gradient.as_slice::<f32>().expect("f32").par_chunks(PIECE);
+        numbers(&mut weights).zip(g).zip(m.zip(v)).zip(e).for_each(|(((p, g), (m, v)), e)| pass(p, g, m, v, e, f));
+    }
+    [*first, *second, *average] = state.map(|data| Tensor::from_data(data, &device));
+    Tensor::from_data(weights, &device)
+}
+
+/// The same with any device's tensors.
+fn update(
+    weights: Tensor<1>,
+    moments: &mut [Tensor<1>; 2],
+    average: &mut Tensor<1>,
+    gradient: Tensor<1>,
+    f: &Factors,
+) -> Tensor<1> {
+    let [m, v] = moments;
+    let g = gradient.mul_scalar(f.clip);
+    *m = m.clone().mul_scalar(f.betas[0]) + g.clone().mul_scalar(1.0 - f.betas[0]);
+    *v = v.clone().mul_scalar(f.betas[1]) + g.square().mul_scalar(1.0 - f.betas[1]);
+    let change = m.clone().mul_scalar(f.rate) / v.clone().sqrt().mul_scalar(f.root).add_scalar(EPSILON);
+    let weights = weights.mul_scalar(f.keep) - change;
+    follow(average, weights.clone(), f.ema);
+    weights
+}
+
+fn follow(average: &mut Tensor<1>, weights: Tensor<1>, decay: f32) {
+    *average = average.clone() + (weights - average.clone()).mul_scalar(1.0 - decay);
+}
+
+/// What [`update`] does to each number.
+#[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma"))]
+fn pass(
+    weights: &mut [f32],
+    gradient: &[f32],
+    first: &mut [f32],
+    second: &mut [f32],
+    average: &mut [f32],
+    f: &Factors,
+) {
+    let numbers = weights.iter_mut().zip(gradient).zip(first.iter_mut().zip(second)).zip(average);
+    for (((p, g), (m, v)), e) in numbers {
+        let g = f.clip * g;
+        *m = f.betas[0] * *m + (1.0 - f.betas[0]) * g;
+        *v = f.betas[1] * *v + (1.0 - f.betas[1]) * g * g;
+        *p = f.keep * *p - f.rate * *m / (f.root * v.sqrt() + EPSILON);
+        *e += (1.0 - f.ema) * (*p - *e);
+    }
+}
+
+/// The sum of squares, in pieces.
+fn square_sum(values: &[f32]) -> f64 {
+    /// Of one piece, in lanes.
+    #[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma"))]
+    fn piece(values: &[f32]) -> f64 {
+        let (whole, rest) = values.as_chunks::<32>();
+        let mut lanes = [0f32; 32];
+        for x in whole {
+            lanes.iter_mut().zip(x).for_each(|(lane, x)| *lane += x * x);
+        }
+        lanes.iter().map(|&x| f64::from(x)).sum::<f64>() + rest.iter().map(|x| f64::from(x * x)).sum::<f64>()
+    }
+    // Added in order, whoever has computed them.
+    values.par_chunks(PIECE).map(piece).collect::<Vec<f64>>().iter().sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use burn::optim::{AdamWConfig, GradientsParams};
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+
+    #[derive(Module, Debug)]
+    struct Toy {
+        matrix: Param<Tensor<2>>,
+        vector: Param<Tensor<1>>,
+        unused: Param<Tensor<1>>,
+    }
+
+    fn random<const D: usize>(shape: [usize; D], rng: &mut ChaCha8Rng) -> Tensor<D> {
+        let values: Vec<f32> = (0..shape.iter().product()).map(|_| rng.random_range(-1.0..1.0)).collect();
+        Tensor::from_data(TensorData::new(values, shape), &Device::flex())
+    }
+
+    fn toy() -> Toy {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        Toy {
+            matrix: Param::from_tensor(random([190, 150], &mut rng).autodiff()),
+            vector: Param::from_tensor(random([37], &mut rng).autodiff()),
+            unused: Param::from_tensor(random([5], &mut rng).autodiff()),
+        }
+    }
+
+    /// Of a loss whose gradient differs from step to step.
+    fn gradients(toy: &Toy, step: u64) -> Gradients {
+        let mut rng = ChaCha8Rng::seed_from_u64(100 + step);
+        let (a, b) = (random([190, 150], &mut rng).autodiff(), random([37], &mut rng).autodiff());
+        ((toy.matrix.val() * a).sum() + (toy.vector.val().square() * b).sum()).backward()
+    }
+
+    fn values(toy: &Toy) -> [Vec<f32>; 3] {
+        let weights = Weights::of(toy).0;
+        std::array::from_fn(|i| weights[i].to_data().try_to_vec().unwrap())
+    }
+
+    fn close(a: &[f32], b: &[f32]) -> bool {
+        a.len() == b.len() && a.iter().zip(b).all(|(x, y)| (x - y).abs() < 2e-6)
+    }
+
+    fn config(decay: Decay) -> OptimizerConfig {
+        OptimizerConfig { betas: (0.9, 0.95), weight_decay: 0.3, decay, ..OptimizerConfig::default() }
+    }
+
+    fn step(time: u64, clip: f32) -> Step {
+        Step { time, rate: 1e-2 * time as f64, clip, ema: 0.7 }
+    }
+
+    #[test]
+    fn steps_and_averages_are_those_of_burn() {
+        let reference =
+            AdamWConfig::new().with_weight_decay(0.3).with_beta_1(0.9).with_beta_2(0.95).with_epsilon(EPSILON);
+        let (mut reference, mut theirs) = (reference.init(), toy());
+        let (mut optimizer, mut ours) = (AdamW::new(3), toy());
+        let mut average = Weights::of(&ours);
+        let mut expected_average = values(&ours);
+        for time in 1..=6 {
+            let clip = if time == 3 { 0.25 } else { 1.0 };
+            let mut flat = Flat::of(&mut gradients(&ours, time), &ours);
+            let norm = flat.norm(&Device::flex()).into_scalar::<f32>();
+            let squares = |g: Option<Vec<f32>>| g.unwrap().iter().map(|x| f64::from(*x).powi(2)).sum::<f64>();
+            let given = gradients(&theirs, time);
+            let matrix = theirs.matrix.val().grad(&given).unwrap();
+            let vector = theirs.vector.val().grad(&given).unwrap();
+            let truth =
+                (squares(matrix.to_data().try_to_vec().ok()) + squares(vector.to_data().try_to_vec().ok())).sqrt();
+            assert!((f64::from(norm) / truth - 1.0).abs() < 1e-6, "{norm} {truth}");
+            ours = optimizer.step(ours, flat, &mut average, &config(Decay::All), step(time, clip));
+            let mut clipped = GradientsParams::new();
+            clipped.register(theirs.matrix.id, matrix * clip);
+            clipped.register(theirs.vector.id, vector * clip);
+            theirs = reference.step(1e-2 * time as f64, theirs, clipped);
+            let (found, expected) = (values(&ours), values(&theirs));
+            for i in 0..3 {
+                assert!(close(&found[i], &expected[i]), "step {time}, parameter {i}");
+                for (average, x) in expected_average[i].iter_mut().zip(&expected[i]) {
+                    *average = 0.7 * *average + 0.3 * x;
+                }
+                let found: Vec<f32> = average.0[i].to_data().try_to_vec().unwrap();
+                assert!(close(&found, &expected_average[i]), "average after step {time}, parameter {i}");
+            }
+        }
+    }
+
+    #[test]
+    fn vectors_need_not_decay() {
+        let run = |decay: Decay| {
+            let toy = toy();
+            let flat = Flat::of(&mut gradients(&toy, 1), &toy);
+            let (mut average, mut optimizer) = (Weights::of(&toy), AdamW::new(3));
+            values(&optimizer.step(toy, flat, &mut average, &config(decay), step(1, 1.0)))
+        };
+        let (all, matrices, before) = (run(Decay::All), run(Decay::Matrices), values(&toy()));
+        assert_eq!(all[0], matrices[0]);
+        let kept = 1.0 - 1e-2 * 0.3;
+        let undecayed: Vec<f32> =
+            all[1].iter().zip(&before[1]).map(|(after, before)| after + (1.0 - kept) * before).collect();
+        assert!(close(&matrices[1], &undecayed) && !close(&all[1], &undecayed));
+    }
+
+    #[test]
+    fn other_devices_compute_the_same() {
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        let mut given = || random([40_000], &mut rng);
+        let (weights, m, v, e, g) = (given(), given(), given().square(), given(), given());
+        let factors = Factors::new(&config(Decay::All), step(4, 0.5), 2);
+        let [one, two] = [update_in_place, update].map(|update| {
+            let (mut moments, mut average) = ([m.clone(), v.clone()], e.clone());
+            let new = update(weights.clone(), &mut moments, &mut average, g.clone(), &factors);
+            let [m, v] = moments;
+            [new, m, v, average].map(|t| t.into_data().try_to_vec::<f32>().unwrap())
+        });
+        assert!(one.iter().zip(&two).all(|(a, b)| close(a, b)));
+    }
+
+    #[test]
+    fn weights_of_which_there_is_no_copy_stay_where_they_are() {
+        let vector = vec![1f32; 1000];
+        let place = vector.as_ptr().cast::<u8>();
+        let tensor = Tensor::<1>::from_data(TensorData::new(vector, [1000]), &Device::flex());
+        let mut toy = Toy { vector: Param::from_tensor(tensor.autodiff()), ..toy() };
+        let mut optimizer = AdamW::new(3);
+        let mut average = Weights([190 * 150, 1000, 5].map(|n| Tensor::zeros([n], &Device::flex())).to_vec());
+        for time in 1..=2 {
+            let loss = (toy.matrix.val().sum() + toy.vector.val().square().sum()) * time as f32;
+            let flat = Flat::of(&mut loss.backward(), &toy);
+            toy = optimizer.step(toy, flat, &mut average, &config(Decay::All), step(time, 1.0));
+        }
+        assert_eq!(toy.vector.into_value().inner().into_data().as_bytes().as_ptr(), place);
+    }
+
+    #[test]
+    fn a_saved_state_goes_on() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("optimizer.safetensors");
+        let (mut toy, mut optimizer) = (toy(), AdamW::new(3));
+        let mut average = Weights::of(&toy);
+        let mut next = |toy: Toy, optimizer: &mut AdamW, time: u64| {
+            let flat = Flat::of(&mut gradients(&toy, time), &toy);
+            optimizer.step(toy, flat, &mut average, &config(Decay::All), step(time, 1.0))
+        };
+        toy = next(toy, &mut optimizer, 1);
+        optimizer.save(&path).unwrap();
+        let weights = Weights::of(&toy);
+        let mut other = AdamW::load(&path, &weights, &Device::flex()).unwrap();
+        assert!(other.moments[2].is_none(), "a parameter without gradients has no state");
+        let copy = toy.clone();
+        assert_eq!(values(&next(toy, &mut optimizer, 2)), values(&next(copy, &mut other, 2)));
+
+        let fewer = Weights(vec![Tensor::zeros([4], &Device::flex())]);
+        let e = AdamW::load(&path, &fewer, &Device::flex()).err().expect("refused").to_string();
+        assert!(e.contains("`0.0`: expected 4"), "{e}");
+        std::fs::write(&path, b"nonsense").unwrap();
+        assert!(matches!(AdamW::load(&path, &weights, &Device::flex()), Err(FlowError::State { .. })));
+    }
+}
