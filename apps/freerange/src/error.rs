@@ -1,7 +1,9 @@
 //! One error for the command line: the chain of causes, and the exit code.
 
-use std::{error::Error, fmt, path::Path};
+use std::{error::Error, fmt, io, path::Path};
 
+use freerange_data::DataError;
+use freerange_fit::FitError;
 use freerange_flow::FlowError;
 
 /// Why a command ended without its result.
@@ -22,9 +24,11 @@ impl CliError {
         Self { source: source.into(), code: 1 }
     }
 
-    /// A file could not be read or written: exit code 2.
-    pub fn file(path: &Path, source: impl fmt::Display) -> Self {
-        Self::input(format!("{}: {source}", path.display()))
+    /// A file could not be read or written: exit code 2, or 1 where the system failed.
+    pub fn file(path: &Path, source: impl Into<Box<dyn Error + Send + Sync>>) -> Self {
+        let source = source.into();
+        let text = format!("{}: {source}", path.display());
+        Self { code: code_of(&*source), source: text.into() }
     }
 
     /// What the process ends with.
@@ -35,41 +39,145 @@ impl CliError {
 
 impl fmt::Display for CliError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}", self.source)?;
+        let mut last = self.source.to_string();
+        f.write_str(&last)?;
         let mut cause = self.source.source();
         while let Some(e) = cause {
-            write!(f, "\n  because: {e}")?;
+            let text = e.to_string();
+            // Many an error names its cause itself.
+            if !last.contains(&text) {
+                write!(f, "\n  because: {text}")?;
+                last = text;
+            }
             cause = e.source();
         }
         Ok(())
     }
 }
 
+/// The exit code of an error that is not known more closely: 1 where the system failed, 2 where what was given cannot be
+/// used.
+fn code_of(error: &(dyn Error + 'static)) -> u8 {
+    let mut next = Some(error);
+    while let Some(e) = next {
+        let io = match e.downcast_ref::<image::ImageError>() {
+            Some(image::ImageError::IoError(io)) => Some(io),
+            _ => e.downcast_ref(),
+        };
+        if io.is_some_and(|io| !is_about_input(io.kind())) {
+            return 1;
+        }
+        next = e.source();
+    }
+    2
+}
+
+/// Whether another path, or another file there, would help; full disks, lost connections and the like are not of this kind.
+fn is_about_input(kind: io::ErrorKind) -> bool {
+    use io::ErrorKind as K;
+    matches!(
+        kind,
+        K::NotFound
+            | K::PermissionDenied
+            | K::AlreadyExists
+            | K::IsADirectory
+            | K::NotADirectory
+            | K::DirectoryNotEmpty
+            | K::ReadOnlyFilesystem
+            | K::InvalidFilename
+            | K::InvalidInput
+            | K::InvalidData
+            | K::UnexpectedEof
+    )
+}
+
 impl From<FlowError> for CliError {
     fn from(e: FlowError) -> Self {
-        // A loss that stops being a number is no fault of what the user gave.
-        let code = if matches!(e, FlowError::NotFinite { .. } | FlowError::NoGradient) { 1 } else { 2 };
-        Self { source: e.into(), code }
+        match e {
+            FlowError::Data(e) => e.into(),
+            FlowError::NotFinite { .. } | FlowError::NoGradient => Self::failure(e),
+            _ => Self { code: code_of(&e), source: e.into() },
+        }
     }
 }
 
-macro_rules! input_errors {
+impl From<DataError> for CliError {
+    fn from(e: DataError) -> Self {
+        match e {
+            DataError::Fit(e) => e.into(),
+            DataError::Worker { .. } => Self::failure(e),
+            _ => Self { code: code_of(&e), source: e.into() },
+        }
+    }
+}
+
+impl From<FitError> for CliError {
+    fn from(e: FitError) -> Self {
+        match e {
+            // A loss that stops being a number is no fault of what the user gave.
+            FitError::Diverged { .. } => Self::failure(e),
+            _ => Self { code: code_of(&e), source: e.into() },
+        }
+    }
+}
+
+macro_rules! other_errors {
     ($($error:ty),*) => {$(
         impl From<$error> for CliError {
             fn from(e: $error) -> Self {
-                Self::input(e)
+                Self { code: code_of(&e), source: e.into() }
             }
         }
     )*};
 }
-input_errors!(
+other_errors!(
     freerange_camera::CameraError,
-    freerange_data::DataError,
     freerange_eval::EvalError,
-    freerange_fit::FitError,
     freerange_mesh::MeshError,
     freerange_metrics::MetricsError,
     freerange_model::ModelError,
     freerange_raster::RasterError,
     freerange_splat::SplatError
 );
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn data(kind: io::ErrorKind) -> DataError {
+        DataError::Io { path: "shards/a.tar".into(), source: kind.into() }
+    }
+
+    #[test]
+    fn bad_input_and_failures_have_different_codes() {
+        let diverged = || FitError::Diverged { step: 3, what: "the loss" };
+        let input: [CliError; 4] = [
+            data(io::ErrorKind::NotFound).into(),
+            FlowError::Data(data(io::ErrorKind::PermissionDenied)).into(),
+            FitError::NoViews.into(),
+            CliError::file(Path::new("a"), "expected a folder"),
+        ];
+        assert_eq!(input.map(|e| e.exit_code()), [2; 4]);
+        let failures: [CliError; 8] = [
+            data(io::ErrorKind::StorageFull).into(),
+            FlowError::Data(data(io::ErrorKind::ConnectionReset)).into(),
+            CliError::file(Path::new("a"), io::Error::from(io::ErrorKind::StorageFull)),
+            CliError::file(Path::new("a"), image::ImageError::IoError(io::ErrorKind::StorageFull.into())),
+            diverged().into(),
+            FlowError::Data(DataError::Fit(diverged())).into(),
+            DataError::Worker { index: 1 }.into(),
+            FlowError::NoGradient.into(),
+        ];
+        assert_eq!(failures.map(|e| e.exit_code()), [1; 8]);
+    }
+
+    #[test]
+    fn a_cause_is_told_once() {
+        let found = CliError::from(data(io::ErrorKind::NotFound)).to_string();
+        assert_eq!(found, format!("shards/a.tar: {}", io::Error::from(io::ErrorKind::NotFound)));
+        // An error that does not say why.
+        let source = io::Error::from(io::ErrorKind::NotFound);
+        let error = freerange_camera::CameraError::Read { file: "a.json".into(), source };
+        assert_eq!(CliError::from(error).to_string().matches("because: ").count(), 1);
+    }
+}

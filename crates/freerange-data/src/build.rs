@@ -21,9 +21,9 @@ use crate::items::{Item, Items, draw};
 use crate::manifest::{FORMAT, Failure, Manifest, ObjectRecord, Plan, ShardRecord, record_name, shard_name, to_json};
 use crate::object::{Made, Photographed, Seconds, lap, make};
 use crate::sample::Metadata;
-use crate::shard::{END, object_bytes};
+use crate::shard::{END, ObjectBytes, object_bytes};
 use crate::store::{Store, io_error, sha256};
-use crate::{BuildConfig, DataError, HeldOutPsnr, Split};
+use crate::{BuildConfig, DataError, HeldOutPsnr, Object, Split};
 
 /// Largest finished object, in bytes.
 const MAX_PART: u64 = 4 << 30;
@@ -448,13 +448,16 @@ where
         let whole = |r: &ShardRecord| Ok::<_, DataError>(self.store.size(&r.name())? == Some(r.bytes));
         if let Some(record) = old
             && whole(&record)?
-            && (!self.retry_failed || record.failures.is_empty())
         {
-            // A process killed between the record and the end leaves parts.
-            self.store.remove_folder(&parts(shard))?;
-            record.objects.iter().for_each(|o| self.tell(&o.id, None));
-            record.failures.iter().for_each(|f| self.tell(&f.id, None));
-            return Ok(Scan::Whole(record));
+            if self.retry_failed && !record.failures.is_empty() {
+                self.unpack(&record)?;
+            } else {
+                // A process killed between the record and the end leaves parts.
+                self.store.remove_folder(&parts(shard))?;
+                record.objects.iter().for_each(|o| self.tell(&o.id, None));
+                record.failures.iter().for_each(|f| self.tell(&f.id, None));
+                return Ok(Scan::Whole(record));
+            }
         }
         let folder = parts(shard);
         let there = self.store.list(&folder)?;
@@ -468,6 +471,20 @@ where
             }
         }
         Ok(Scan::Missing(missing))
+    }
+
+    /// Makes parts of the objects of a finished shard again, so that only those that it lacks have to be made.
+    fn unpack(&self, record: &ShardRecord) -> Result<(), DataError> {
+        let (folder, name) = (parts(record.index), record.name());
+        for &ObjectRecord { index, offset, bytes, split, psnr, flagged, ref id, .. } in &record.objects {
+            let bytes = self.store.range(&name, offset, bytes)?;
+            let object =
+                ObjectBytes::new(bytes.clone(), id, self.store.path(&name))?.object(&self.plan.config.depths)?;
+            let statistics = statistics_of(&object, &self.plan.config.depths)?;
+            self.store.write(&format!("{folder}/{}", bytes_name(index)), &bytes)?;
+            self.write_outcome(&folder, index, &Outcome::Made { split, psnr, flagged, statistics })?;
+        }
+        Ok(())
     }
 
     fn item(&self, index: u64) -> Result<Item, DataError> {
@@ -545,12 +562,7 @@ where
             input_fits: made.object.input_fits.iter().map(|f| f.views.clone()).collect(),
             evaluation: evaluation(&made.object.views, config, seed).map_err(|e| chain(&e))?,
         };
-        let mut statistics = BTreeMap::new();
-        for &depth in &config.depths {
-            let mut of_depth = Statistics::default();
-            of_depth.add(made.object.slice(depth).map_err(|e| chain(&e))?).map_err(|e| chain(&e))?;
-            statistics.insert(depth, of_depth);
-        }
+        let statistics = statistics_of(&made.object, &config.depths).map_err(|e| chain(&e))?;
         let leaves = config.shard.leaves.then_some(&made.leaves);
         let bytes = object_bytes(&made.object, leaves, &metadata, config.shard.images, Path::new(shard));
         let bytes = bytes.map_err(|e| chain(&e))?;
@@ -626,6 +638,16 @@ fn bytes_name(index: u64) -> String {
 /// Written after the bytes: where it is, the object is done.
 fn outcome_name(index: u64) -> String {
     format!("{index:010}.json")
+}
+
+/// Statistics over an object's slices, by depth.
+fn statistics_of(object: &Object, depths: &[u32]) -> Result<BTreeMap<u32, Statistics>, DataError> {
+    let of_depth = |&depth: &u32| {
+        let mut statistics = Statistics::default();
+        statistics.add(object.slice(depth)?)?;
+        Ok((depth, statistics))
+    };
+    depths.iter().map(of_depth).collect()
 }
 
 /// An error with its causes, in one line.

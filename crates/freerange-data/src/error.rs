@@ -67,6 +67,16 @@ pub enum DataError {
         /// Number of the object.
         index: u64,
     },
+    /// Too many objects could not be read.
+    #[error("{broken} of {read} objects could not be read, the last one because of: {last}")]
+    TooManyBroken {
+        /// Objects that could not be read.
+        broken: u64,
+        /// Objects asked for.
+        read: u64,
+        /// What was wrong with the last one.
+        last: Box<DataError>,
+    },
     /// The choice of views.
     #[error(transparent)]
     Camera(#[from] freerange_camera::CameraError),

@@ -31,6 +31,11 @@ pub(crate) fn fitted_gaussians(shot: &mut Photographed, config: &ObjectConfig) -
 /// `slice` after `steps` gradient steps, each towards one of the `views`; its rows stay what and where they are in the
 /// order of the tree. Opacities stay within [`OPACITY_RANGE`].
 pub(crate) fn polished(slice: Cloud, views: &[View], steps: usize, seed: u64) -> Result<Cloud, DataError> {
+    adapted(slice, views, steps, POLISH_RATES, seed)
+}
+
+/// As [`polished`], at these rates.
+pub(crate) fn adapted(slice: Cloud, views: &[View], steps: usize, rates: Rates, seed: u64) -> Result<Cloud, DataError> {
     if steps == 0 {
         return Ok(slice);
     }
@@ -42,8 +47,8 @@ pub(crate) fn polished(slice: Cloud, views: &[View], steps: usize, seed: u64) ->
         noise: 0.0,
         opacity_regularizer: 0.0,
         scale_regularizer: 0.0,
-        rates: POLISH_RATES,
-        final_mean_rate: 0.01 * POLISH_RATES.mean,
+        rates,
+        final_mean_rate: 0.01 * rates.mean,
         seed,
         ..FitConfig::default()
     };

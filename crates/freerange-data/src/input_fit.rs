@@ -3,12 +3,13 @@
 use std::ops::ControlFlow;
 
 use freerange_camera::{SelectionConfig, View, select_views};
-use freerange_fit::{quick_fit, tree_slice};
+use freerange_fit::{Rates, quick_fit, tree_slice};
 use freerange_splat::Cloud;
 use glam::DVec3;
 use rand::{Rng, SeedableRng, seq::index};
 use rand_chacha::ChaCha8Rng;
 
+use crate::fitted::adapted;
 use crate::{DataError, ObjectConfig};
 
 /// A quick fit of some of an object's views.
@@ -18,18 +19,15 @@ pub struct InputFit {
     pub views: Vec<usize>,
     /// Its Gaussians, a power of two of them in the order of their tree.
     pub gaussians: Cloud,
+    /// The same Gaussians, one by one, after gradient steps towards all views of the object: what the fit should have been.
+    /// Unlike Gaussians that were made otherwise, they differ from it only where the few views were not enough.
+    pub mended: Cloud,
 }
 
 impl InputFit {
-    /// As `2^depth` Gaussians in the order of their tree.
-    ///
-    /// # Errors
-    /// Where the Gaussians make no tree.
-    pub fn slice(&self, depth: u32) -> Result<Cloud, DataError> {
-        match 1usize.checked_shl(depth) == Some(self.gaussians.len()) {
-            true => Ok(self.gaussians.clone()),
-            false => Ok(tree_slice(&self.gaussians, depth)?),
-        }
+    /// The depth of the tree that its Gaussians are a slice at.
+    pub fn depth(&self) -> u32 {
+        self.gaussians.len().ilog2()
     }
 }
 
@@ -54,6 +52,9 @@ const SETS: [(usize, Spread); 6] = [
     (5, Spread::Random),
 ];
 
+/// Rates of the steps that mend a fit, at the start. Twice those of polishing: there is farther to go.
+const MEND_RATES: Rates = Rates { mean: 6e-3, scale: 2e-2, rotation: 2e-3, opacity: 0.1, color: 5e-3 };
+
 /// Views that an object with fits has at least: some cluster of four then holds four.
 pub(crate) const MIN_VIEWS: usize = 13;
 
@@ -68,7 +69,9 @@ pub(crate) fn input_fits(views: &[View], config: &ObjectConfig, seed: u64) -> Re
         let chosen = draw_set(&centers, SETS[number % SETS.len()], &mut rng)?;
         let inputs: Vec<View> = chosen.iter().map(|&i| views[i].clone()).collect();
         let cloud = quick_fit(&inputs, &config.quick_fit, rng.random(), |_| ControlFlow::Continue(()))?;
-        Ok(InputFit { views: chosen, gaussians: tree_slice(&cloud, depth)? })
+        let gaussians = tree_slice(&cloud, depth)?;
+        let mended = adapted(gaussians.clone(), views, config.mend, MEND_RATES, seed)?;
+        Ok(InputFit { views: chosen, gaussians, mended })
     };
     (0..config.input_fits).map(one).collect()
 }
@@ -87,6 +90,7 @@ fn draw_set(centers: &[DVec3], set: (usize, Spread), rng: &mut ChaCha8Rng) -> Re
 mod tests {
     use super::*;
     use crate::Object;
+    use crate::quality::psnr_over_white;
     use crate::tests::tiny_config;
     use freerange_fit::QuickFitConfig;
 
@@ -95,6 +99,7 @@ mod tests {
         let mut config = ObjectConfig { views: MIN_VIEWS, ..tiny_config() };
         let without = Object::generate(5, &config, &[3]).unwrap();
         config.input_fits = 4;
+        config.mend = 100;
         config.quick_fit = QuickFitConfig { iterations: 20, gaussians: 64, render_size: 32 };
         let with = Object::generate(5, &config, &[3]).unwrap();
         assert_eq!((&with.slices, &without.slices), (&without.slices, &with.slices));
@@ -107,10 +112,12 @@ mod tests {
             assert_eq!(views.len(), fit.views.len(), "no view twice");
             assert!(views.iter().all(|&v| v < MIN_VIEWS));
             assert_eq!(fit.gaussians.len(), 64);
-            // The deepest slice is what is stored; others come from its tree.
-            assert_eq!(fit.slice(6).unwrap(), fit.gaussians);
-            assert_eq!(tree_slice(&fit.gaussians, 6).unwrap().len(), 64);
-            assert_eq!(fit.slice(4).unwrap(), tree_slice(&fit.gaussians, 4).unwrap());
+            assert_eq!(fit.depth(), 6);
+            // Mended, they are the same ones, and show all views better.
+            let psnr = |cloud: &Cloud| psnr_over_white(cloud, &with.views).unwrap();
+            assert!(psnr(&fit.mended) > psnr(&fit.gaussians) + 1.0);
+            let moved = |i: usize| fit.gaussians.mean(i).distance(fit.mended.mean(i));
+            assert!((0..64).map(moved).sum::<f64>() / 64.0 < 0.1);
         }
         // One side: closer together than around.
         let spread = |fit: &InputFit| {

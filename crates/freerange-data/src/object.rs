@@ -42,6 +42,8 @@ pub struct ObjectConfig {
     pub input_fits: usize,
     /// How these are made.
     pub quick_fit: QuickFitConfig,
+    /// Gradient steps towards all views that mend each.
+    pub mend: usize,
     /// How the axes of the Gaussians in the tree are labelled.
     pub alignment: Alignment,
     /// Rendered views per object.
@@ -65,6 +67,7 @@ impl Default for ObjectConfig {
             polish: 0,
             input_fits: 0,
             quick_fit: QuickFitConfig::default(),
+            mend: 250,
             alignment: Alignment::Identity,
             views: 40,
             samples_per_axis: 2,

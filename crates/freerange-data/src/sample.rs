@@ -4,7 +4,7 @@
 //! |---|---|
 //! | `KEY.json` | [`Metadata`] |
 //! | `KEY.cameras.json` | name, size, intrinsics and pose of every view; see [`CAMERAS`] |
-//! | `KEY.gaussians.safetensors` | `depth_08` f32 `[256, 14]`, ...: the slices, channels as in [`freerange_splat::channel`]; `leaves` f32 `[n, 14]`, where they are kept: the Gaussians before the tree; `input_fit_00` f16 `[n, 14]`, ...: quick fits of some of the views |
+//! | `KEY.gaussians.safetensors` | `depth_08` f32 `[256, 14]`, ...: the slices, channels as in [`freerange_splat::channel`]; `leaves` f32 `[n, 14]`, where they are kept: the Gaussians before the tree; `input_fit_00` f16 `[n, 14]`, ...: quick fits of some of the views; `input_fit_00_mended`, ...: the same Gaussians fitted to all views |
 //! | `KEY.000.webp`, ... | the views, 8-bit RGBA with straight alpha, in the order of the cameras; or `KEY.000.png`, ... |
 
 use std::collections::BTreeMap;
@@ -127,8 +127,9 @@ pub(crate) fn view_entry(i: usize, format: ImageFormat) -> String {
 /// Name of the tensor of the Gaussians before the tree.
 const LEAVES: &str = "leaves";
 
-fn fit_name(i: usize) -> String {
-    format!("input_fit_{i:02}")
+/// Names of the tensors of quick fit `i`: as it is, and mended.
+fn fit_names(i: usize) -> [String; 2] {
+    [format!("input_fit_{i:02}"), format!("input_fit_{i:02}_mended")]
 }
 
 fn tensor_name(depth: u32) -> String {
@@ -207,12 +208,14 @@ fn encode_gaussians(object: &Object, leaves: Option<&Cloud>, place: Place) -> Re
         tensors.push((LEAVES.into(), Dtype::F32, leaves.len(), bytes_of(leaves)));
     }
     for (i, fit) in object.input_fits.iter().enumerate() {
-        let halves: Vec<f16> = fit.gaussians.rows().iter().map(|v| f16::from_f32(*v)).collect();
-        if let Some(bad) = halves.iter().position(|v| !v.is_finite()) {
-            return Err(place.error("quick fits of numbers that 16 bits hold", fit.gaussians.rows()[bad]));
+        for (name, cloud) in fit_names(i).into_iter().zip([&fit.gaussians, &fit.mended]) {
+            let halves: Vec<f16> = cloud.rows().iter().map(|v| f16::from_f32(*v)).collect();
+            if let Some(bad) = halves.iter().position(|v| !v.is_finite()) {
+                return Err(place.error("quick fits of numbers that 16 bits hold", cloud.rows()[bad]));
+            }
+            let bytes = halves.iter().flat_map(|v| v.to_le_bytes()).collect();
+            tensors.push((name, Dtype::F16, cloud.len(), bytes));
         }
-        let bytes = halves.iter().flat_map(|v| v.to_le_bytes()).collect();
-        tensors.push((fit_name(i), Dtype::F16, fit.gaussians.len(), bytes));
     }
     let view = |dtype, n: usize, bytes| TensorView::new(dtype, vec![n, channel::COUNT], bytes);
     let refused = |e| place.error("tensors safetensors can hold", e);
@@ -361,19 +364,28 @@ pub(crate) fn decode_fits(
             let expected = format!("input_fits of 1 to {count} views, by numbers below {count}");
             return Err(place.of(METADATA).error(expected, format!("{views:?}")));
         }
-        let name = fit_name(i);
-        let tensor = tensors.tensor(&name).map_err(|_| place.error(format!("tensor {name}"), "none"))?;
-        let fits = matches!(tensor.shape(), &[n, channel::COUNT] if n.is_power_of_two() && n <= 1 << MAX_DEPTH);
-        if tensor.dtype() != Dtype::F16 || !fits {
-            let found = format!("{:?} {:?}", tensor.dtype(), tensor.shape());
-            return Err(place.error(format!("tensor {name} of F16 [2^n, {}]", channel::COUNT), found));
-        }
-        let values = tensor.data().as_chunks::<2>().0.iter().map(|b| f16::from_le_bytes(*b).to_f32());
-        let gaussians = Cloud::from_rows(values.collect());
-        gaussians.check_finite().map_err(|e| place.error(format!("finite numbers in tensor {name}"), e))?;
-        Ok(InputFit { views: views.clone(), gaussians })
+        let [name, mended] = fit_names(i);
+        let gaussians = half_cloud(&tensors, &name, None, place)?;
+        let mended = half_cloud(&tensors, &mended, Some(gaussians.len()), place)?;
+        Ok(InputFit { views: views.clone(), gaussians, mended })
     };
     views.iter().enumerate().map(fit).collect()
+}
+
+/// A tensor `[rows, 14]` of finite f16; where no number of rows is given, any power of two.
+fn half_cloud(tensors: &SafeTensors, name: &str, rows: Option<usize>, place: Place) -> Result<Cloud, DataError> {
+    let tensor = tensors.tensor(name).map_err(|_| place.error(format!("tensor {name}"), "none"))?;
+    let fits = matches!(tensor.shape(), &[n, channel::COUNT]
+        if rows.map_or(n.is_power_of_two() && n <= 1 << MAX_DEPTH, |rows| rows == n));
+    if tensor.dtype() != Dtype::F16 || !fits {
+        let found = format!("{:?} {:?}", tensor.dtype(), tensor.shape());
+        let rows = rows.map_or("2^n".into(), |n| n.to_string());
+        return Err(place.error(format!("tensor {name} of F16 [{rows}, {}]", channel::COUNT), found));
+    }
+    let values = tensor.data().as_chunks::<2>().0.iter().map(|b| f16::from_le_bytes(*b).to_f32());
+    let cloud = Cloud::from_rows(values.collect());
+    cloud.check_finite().map_err(|e| place.error(format!("finite numbers in tensor {name}"), e))?;
+    Ok(cloud)
 }
 
 /// A tensor `[rows, 14]` of finite f32; any number of rows where none is given.

@@ -1,5 +1,8 @@
 //! A folder of shards as a source of training objects.
 
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, PoisonError};
+
 use freerange_splat::{Cloud, Statistics};
 use rand::{SeedableRng, seq::SliceRandom};
 use rand_chacha::ChaCha8Rng;
@@ -9,12 +12,15 @@ use crate::shard::ObjectBytes;
 use crate::store::Store;
 use crate::{DataError, Metadata, Object, ObjectSource, Split};
 
-/// The objects of one part of a folder of shards in a shuffled order, over and over.
+/// The objects of one part of a folder of shards, over and over, each time in another order.
 ///
+/// Object number `index` is a function of the seed and `index` alone, so that reading can begin at any number.
 /// One read per object, of just its bytes: from a local folder as from far away.
 pub struct Shards {
     store: Store,
-    order: Vec<(u32, u32)>, // (shard, object in it)
+    objects: Vec<(u32, u32)>, // (shard, object in it)
+    seed: u64,
+    orders: Mutex<VecDeque<(u64, Arc<[u32]>)>>, // of the last epochs that were asked for
     depths: Vec<u32>,
     manifest: Manifest,
 }
@@ -64,27 +70,32 @@ impl Shards {
             }
         }
         let wanted = |o: &ObjectRecord| !o.flagged && split.is_none_or(|s| s == o.split);
-        let mut order: Vec<(u32, u32)> = Vec::new();
+        let mut all: Vec<(u32, u32)> = Vec::new();
         for (s, shard) in manifest.shards.iter().enumerate() {
             let objects = shard.objects.iter().enumerate().filter(|(_, o)| wanted(o));
-            order.extend(objects.map(|(i, _)| (s as u32, i as u32)));
+            all.extend(objects.map(|(i, _)| (s as u32, i as u32)));
         }
-        if order.is_empty() {
+        if all.is_empty() {
             let part = split.map_or("any part".into(), |s| format!("part {s:?}"));
             return Err(problem(format!("expected objects in {part} that are not flagged, found none")));
         }
-        order.shuffle(&mut ChaCha8Rng::seed_from_u64(manifest.plan.config.seed));
-        Ok(Self { store: store.clone(), order, depths: depths.to_vec(), manifest })
+        let (seed, orders) = (manifest.plan.config.seed, Mutex::default());
+        Ok(Self { store: store.clone(), objects: all, seed, orders, depths: depths.to_vec(), manifest })
+    }
+
+    /// The same objects in the orders that `seed` gives instead of those of the folder's own seed.
+    pub fn shuffled_by(self, seed: u64) -> Self {
+        Self { seed, orders: Mutex::default(), ..self }
     }
 
     /// Number of different objects.
     pub fn len(&self) -> usize {
-        self.order.len()
+        self.objects.len()
     }
 
     /// Whether there is no object; never so for an opened folder.
     pub fn is_empty(&self) -> bool {
-        self.order.is_empty()
+        self.objects.is_empty()
     }
 
     /// What the folder says of itself.
@@ -119,9 +130,30 @@ impl Shards {
     }
 
     fn locate(&self, index: u64) -> (String, &ObjectRecord) {
-        let (shard, i) = self.order[(index % self.order.len() as u64) as usize];
+        let (epoch, place) = (index / self.objects.len() as u64, index % self.objects.len() as u64);
+        let (shard, i) = self.objects[self.order(epoch)[place as usize] as usize];
         let shard = &self.manifest.shards[shard as usize];
         (shard.name(), &shard.objects[i as usize])
+    }
+
+    /// The order of all objects in one epoch.
+    fn order(&self, epoch: u64) -> Arc<[u32]> {
+        /// Readers that are a little ahead are in the next epoch already.
+        const KEPT: usize = 2;
+        let mut orders = self.orders.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((_, order)) = orders.iter().find(|(e, _)| *e == epoch) {
+            return order.clone();
+        }
+        let mut order: Vec<u32> = (0..self.objects.len() as u32).collect();
+        let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
+        rng.set_stream(epoch);
+        order.shuffle(&mut rng);
+        let order: Arc<[u32]> = order.into();
+        orders.push_back((epoch, order.clone()));
+        if orders.len() > KEPT {
+            orders.pop_front();
+        }
+        order
     }
 
     fn bytes(&self, index: u64) -> Result<ObjectBytes, DataError> {

@@ -328,10 +328,9 @@ impl NewFile {
                     let _ = std::fs::remove_file(&partial);
                     return Err(io_error(&self.target)(source));
                 }
-                // The new name, too, must outlive a power cut; not every system lets a folder be opened.
-                #[cfg(unix)]
+                // The new name, too, must outlive a power cut.
                 if let Some(folder) = self.target.parent().filter(|p| !p.as_os_str().is_empty()) {
-                    File::open(folder).and_then(|f| f.sync_all()).map_err(io_error(folder))?;
+                    freerange_splat::sync_folder(folder).map_err(io_error(folder))?;
                 }
             }
             #[cfg(feature = "cloud")]

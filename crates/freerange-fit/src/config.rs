@@ -364,7 +364,7 @@ mod tests {
             fit.check().unwrap();
             let due = |step: &usize| {
                 *step >= fit.growth_start
-                    && step % fit.growth_interval == 0
+                    && step.is_multiple_of(fit.growth_interval)
                     && (*step as f64) < fit.growth_stop * steps as f64
             };
             let rounds = (0..steps).filter(due).count();

@@ -128,7 +128,7 @@ impl Batch {
         let (b, n) = (objects.len(), 1usize << stage.depth);
         let start = loss.start.filter(|start| rng.random::<f32>() < start.share);
         let self_conditioned = rng.random::<f32>() < loss.self_conditioning;
-        let fits = start.map(|_| same_fit(objects, loss.held_views, rng)).transpose()?;
+        let fits = start.map(|_| same_fit(objects, stage.depth, loss.held_views, rng)).transpose()?;
         let inputs = rng.random_range(loss.input_views.0..=loss.input_views.1);
         let one_sided = rng.random::<f32>() < loss.one_sided;
 
@@ -138,10 +138,11 @@ impl Batch {
         let (mut t, mut conditional, mut backgrounds) = (Vec::new(), Vec::new(), Vec::new());
         let (mut seen, mut held) = (Vec::new(), Vec::new());
         for (i, object) in objects.iter().enumerate() {
-            let slice = object.slice(stage.depth)?;
-            let mut slice = match loss.random_patches {
-                true => slice.shuffled(rng),
-                false => slice.clone(),
+            let fit = fits.as_ref().map(|fits| fits[i]);
+            let mut slice = match fit {
+                Some(fit) => fit.mended.clone(),
+                None if loss.random_patches => object.slice(stage.depth)?.shuffled(rng),
+                None => object.slice(stage.depth)?.clone(),
             };
             let mut epsilon: Vec<f32> = (0..n * channel::COUNT).map(|_| StandardNormal.sample(rng)).collect();
             let first = start.map_or(0.0, |s| s.time);
@@ -151,7 +152,6 @@ impl Batch {
             t.push(time);
             conditional.push(if blind { 0.0 } else { 1.0 });
             backgrounds.push(draw_background(rng));
-            let fit = fits.as_ref().map(|fits| fits[i]);
             let (chosen, rest) = match fit {
                 Some(fit) => views_of(fit, &object.views, rng),
                 None => choose_views(&object.views, inputs, one_sided, rng),
@@ -166,17 +166,19 @@ impl Batch {
             seen.push(chosen.into_iter().map(moved).collect::<Vec<_>>());
             held.push(rest.into_iter().take(loss.held_views).map(moved).collect::<Vec<_>>());
             let clean = normalization.normalize(&slice);
-            loss.coupling.pair(&mut epsilon, &clean);
-            if let Some(fit) = fit {
-                let mut guess = fit.slice(stage.depth)?;
-                if frame != Similarity::IDENTITY {
-                    guess.transform(frame.scale, frame.rotation, frame.translation);
+            match fit {
+                None => loss.coupling.pair(&mut epsilon, &clean),
+                Some(fit) => {
+                    let mut guess = fit.gaussians.clone();
+                    if frame != Similarity::IDENTITY {
+                        guess.transform(frame.scale, frame.rotation, frame.translation);
+                    }
+                    let guess = normalization.normalize(&guess);
+                    loss.coupling.pair(&mut epsilon, &guess); // as when sampling
+                    let w = guess_weight(time, first);
+                    on_path.extend(clean.iter().zip(&guess).map(|(x, g)| x + w * (g - x)));
+                    guesses.extend(guess);
                 }
-                let mut guess = normalization.normalize(&guess);
-                loss.coupling.pair(&mut guess, &clean);
-                let w = guess_weight(time, first);
-                on_path.extend(clean.iter().zip(&guess).map(|(x, g)| x + w * (g - x)));
-                guesses.extend(guess);
             }
             data.extend(clean);
             noise.extend(epsilon);
@@ -210,9 +212,10 @@ impl Batch {
     }
 }
 
-/// A quick fit of each object, of equally many views: which one, is drawn.
+/// A quick fit of each object, of `2^depth` Gaussians and equally many views: which one, is drawn.
 fn same_fit<'a>(
     objects: &'a [Arc<Object>],
+    depth: u32,
     held_views: usize,
     rng: &mut ChaCha8Rng,
 ) -> Result<Vec<&'a InputFit>, FlowError> {
@@ -221,13 +224,18 @@ fn same_fit<'a>(
     let count = objects.first().and_then(|o| o.input_fits.get(number)).map_or(0, |f| f.views.len());
     let fitting = |o: &'a Arc<Object>| {
         let fit = o.input_fits.get(number);
-        let enough = |f: &&InputFit| f.views.len() == count && count + held_views <= o.views.len();
+        let enough =
+            |f: &&InputFit| f.depth() == depth && f.views.len() == count && count + held_views <= o.views.len();
         fit.filter(enough).ok_or_else(|| FlowError::Fits {
             object: o.id.clone(),
-            expected: format!("a quick fit number {number} of {count} views, and {held_views} views besides"),
+            expected: format!(
+                "a quick fit number {number} of {} Gaussians and {count} views, and {held_views} views besides",
+                1u64 << depth
+            ),
             found: {
-                let counts: Vec<usize> = o.input_fits.iter().map(|f| f.views.len()).collect();
-                format!("fits of {counts:?} of its {} views", o.views.len())
+                let each: Vec<(usize, usize)> =
+                    o.input_fits.iter().map(|f| (f.gaussians.len(), f.views.len())).collect();
+                format!("{} views, and fits of (Gaussians, views) {each:?}", o.views.len())
             },
         })
     };

@@ -41,8 +41,8 @@ pub struct TrainConfig {
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DataConfig {
-    /// Shards made by `freerange data build`: a folder, or a URL (`s3://`, `gs://`, `https://`). Without it, objects are
-    /// generated on the fly, without end.
+    /// Shards made by `freerange data build`: a folder (in a file, its path is relative to the file), or a URL (`s3://`,
+    /// `gs://`, `https://`). Without it, objects are generated on the fly, without end.
     pub shards: Option<String>,
     /// Train on the shards that are finished by now where the folder is still being made; a run that goes on later takes
     /// those of then, and is no longer the one never stopped.
@@ -139,7 +139,8 @@ pub struct LossConfig {
     pub frame_jitter: FrameJitter,
 }
 
-/// How training starts from quick fits. Such batches have the input views of their fits.
+/// How training starts from quick fits. Such batches have the input views of their fits, and lead to what these should
+/// have been: [`InputFit::mended`](freerange_data::InputFit).
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StartLoss {
@@ -207,7 +208,7 @@ pub struct OptimizerConfig {
     pub clip: f32,
     /// Decay of the moving average of the weights (reached gradually over the first steps).
     pub ema: f32,
-    /// Arithmetic of the blocks' linear layers; weights and sums stay in 32 bits.
+    /// Arithmetic of the blocks' linear layers, `f32` or `bf16`; weights and sums stay in 32 bits.
     pub compute: Compute,
     /// Keep only the input of each block, and compute the block again for its gradient: a fraction of the memory for a
     /// third more work.
@@ -401,6 +402,12 @@ impl TrainConfig {
         if let Some(start) = l.start {
             check((0.0..=1.0).contains(&start.share), "loss.start.share", "0 to 1", start.share.to_string())?;
             check((0.0..1.0).contains(&start.time), "loss.start.time", "0 to below 1", start.time.to_string())?;
+            check(
+                !l.random_patches,
+                "loss.random_patches",
+                "false with loss.start, whose fits are in the tree's order",
+                "true".into(),
+            )?;
             let made = self.data.shards.is_some() || self.data.object.input_fits > 0;
             check(made, "data.object.input_fits", "at least 1 with loss.start", "0".into())?;
         }
@@ -422,12 +429,17 @@ impl TrainConfig {
         check(o.learning_rate > 0.0, "optimizer.learning_rate", "above 0", o.learning_rate.to_string())?;
         check((0.0..1.0).contains(&o.ema), "optimizer.ema", "0 to below 1", o.ema.to_string())?;
         check(o.clip > 0.0, "optimizer.clip", "above 0", o.clip.to_string())?;
+        // Nothing scales the loss here, and without that the gradients of many weights round to zero.
+        check(o.compute != Compute::F16, "optimizer.compute", "\"f32\" or \"bf16\"", "\"f16\"".into())?;
         check(self.data.window > 0, "data.window", "at least 1", self.data.window.to_string())?;
         check(self.data.workers > 0, "data.workers", "at least 1", self.data.workers.to_string())?;
         check(self.data.statistics_objects > 0, "data.statistics_objects", "at least 1", "0".into())?;
         let p = self.model.gaussians_per_token;
         for s in &self.stages {
             check((1usize << s.depth) >= p, "stage.depth", "at least one token", s.depth.to_string())?;
+        }
+        if let Some(depth) = self.sample.depth {
+            check((1usize << depth) >= p, "sample.depth", "at least one token", depth.to_string())?;
         }
         Ok(())
     }

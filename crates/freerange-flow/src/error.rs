@@ -37,20 +37,20 @@ pub enum FlowError {
         /// What it is.
         found: String,
     },
-    /// The loss or a gradient stopped being a number.
+    /// The loss or the gradients have stopped being numbers.
     #[error(
-        "step {step}: the {what} is {value}: training stopped; the last good state is in {}, the batch can be made \
-         again from the seed and the step", state.display()
+        "step {last}: expected a finite loss and finite gradients, found a loss of {loss} and gradients of norm {norm}, as in \
+         the {steps} steps up to it: training stopped; none of them changed the weights"
     )]
     NotFinite {
-        /// The step that failed.
-        step: u64,
-        /// Which quantity.
-        what: String,
-        /// Its value.
-        value: f32,
-        /// Where the state before the step lies.
-        state: PathBuf,
+        /// Steps in a row.
+        steps: u32,
+        /// The last of them.
+        last: u64,
+        /// Its loss.
+        loss: f32,
+        /// The norm of its gradients.
+        norm: f32,
     },
     /// A training state cannot be continued.
     #[error("{}: {problem}", path.display())]

@@ -17,7 +17,8 @@ pub(crate) const PRESETS: [(&str, &str); 3] = [
 ];
 
 /// Reads a configuration and those that it descends from, and merges them: tables key by key, everything else (lists
-/// among it) as the descendant has it. A parent is the name of a preset, or a path relative to the file that names it.
+/// among it) as the descendant has it. A parent is the name of a preset, or a path relative to the file that names it; so
+/// are the shards.
 pub(crate) fn load(path: &Path) -> Result<Table, FlowError> {
     let mut chain: Vec<(PathBuf, Table)> = Vec::new();
     let mut next = Some(path.to_path_buf());
@@ -48,10 +49,24 @@ pub(crate) fn load(path: &Path) -> Result<Table, FlowError> {
                 return Err(state(format!("field `parent`: expected {expected}, found {other}")));
             }
         };
+        if preset.is_none() {
+            locate(&mut table, path.parent().unwrap_or(Path::new("")));
+        }
         chain.push((identity, table));
     }
     let oldest_first = chain.into_iter().rev().map(|(_, table)| table);
     Ok(oldest_first.reduce(merged).unwrap_or_default())
+}
+
+/// Makes the path of the shards, which is relative to the file that names it, one that can be opened from here.
+fn locate(table: &mut Table, folder: &Path) {
+    let shards = table.get_mut("data").and_then(|data| data.get_mut("shards"));
+    if let Some(Value::String(place)) = shards
+        && !place.contains("://")
+        && let Some(found) = folder.join(&*place).to_str()
+    {
+        *place = found.to_owned();
+    }
 }
 
 /// `over` laid over `under`.
@@ -96,6 +111,25 @@ mod tests {
         expected.loss.seen = false;
         expected.loss.held_views = 1;
         assert_eq!(found, expected);
+    }
+
+    #[test]
+    fn shards_lie_beside_the_file_that_names_them() {
+        let files = [
+            ("a/child.toml", "parent = \"../b/middle.toml\"\n"),
+            ("b/middle.toml", "parent = \"tiny\"\ndata.shards = \"far/shards\"\n"),
+            ("b/cloud.toml", "parent = \"tiny\"\ndata.shards = \"s3://bucket/shards\"\n"),
+            ("b/whole.toml", "parent = \"tiny\"\ndata.shards = \"/shards\"\n"),
+        ];
+        let folder = place(&files);
+        let shards = |name: &str| TrainConfig::load(&folder.path().join(name)).unwrap().data.shards.unwrap();
+        fs::create_dir_all(folder.path().join("b/far/shards")).unwrap();
+        assert_eq!(
+            fs::canonicalize(shards("a/child.toml")).unwrap(),
+            folder.path().join("b/far/shards").canonicalize().unwrap()
+        );
+        assert_eq!(shards("b/cloud.toml"), "s3://bucket/shards");
+        assert_eq!(shards("b/whole.toml"), "/shards");
     }
 
     #[test]

@@ -7,6 +7,7 @@ pub mod config;
 pub mod coupling;
 mod error;
 mod inherit;
+pub mod log;
 mod optimizer;
 pub mod path;
 pub mod photometric;

@@ -287,8 +287,13 @@ pub fn reconstruct(
     mut progress: impl FnMut(&Step),
 ) -> Result<Vec<Vec<Cloud>>, FlowError> {
     config.validate()?;
+    let (depth, fewest) = (config.depth.unwrap_or(checkpoint.depth), checkpoint.config.gaussians_per_token);
+    if 1usize << depth < fewest {
+        let expected = format!("at least {}: a token of the model is {fewest} Gaussians", fewest.ilog2());
+        return Err(FlowError::Config { field: "sample.depth".into(), expected, found: depth.to_string() });
+    }
     let model = checkpoint.model.clone().with_compute(config.compute);
-    let (b, n) = (objects.len() * seeds.len(), 1usize << config.depth.unwrap_or(checkpoint.depth));
+    let (b, n) = (objects.len() * seeds.len(), 1usize << depth);
 
     // The images are encoded once; every sample and step shares the tokens.
     let views: Vec<Vec<&View>> = objects.iter().map(|o| o.iter().collect()).collect();

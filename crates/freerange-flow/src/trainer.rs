@@ -14,7 +14,7 @@ use burn::{
 };
 use freerange_data::{Generated, Object, ObjectSource, Shards, Split, Store, Stream};
 use freerange_model::{Checkpoint, Compute, FreeRange, ModelConfig};
-use freerange_splat::{Normalization, Statistics, channel};
+use freerange_splat::{Normalization, Statistics, channel, sync_folder, sync_tree};
 use rand::seq::index::sample as sample_indices;
 
 use crate::{
@@ -29,6 +29,9 @@ use crate::{
 
 /// Decay of the running mean square of the photometric gradient.
 const GRADIENT_STATISTIC_DECAY: f32 = 0.99;
+/// Steps in a row whose loss or gradients are not finite that end a run. Fewer are left out: a batch may be bad, a model
+/// that always fails is.
+const NOT_FINITE_IN_A_ROW: u32 = 5;
 
 /// What is reported after a step.
 #[derive(Clone, Debug, serde::Serialize)]
@@ -51,6 +54,10 @@ pub struct Report {
     pub seconds: f64,
     /// Of these, seconds spent waiting for objects and making tensors of them (for the next step; a GPU works meanwhile).
     pub data_seconds: f64,
+    /// Steps so far whose loss or gradients were not finite: they changed nothing.
+    pub skipped: u64,
+    /// Objects so far that could not be read.
+    pub broken: u64,
 }
 
 /// The part of the state that is neither weights nor optimiser.
@@ -59,7 +66,19 @@ struct Progress {
     step: u64,
     seconds: f64,
     gradient_square: [f32; channel::COUNT],
+    /// Whether the mean square of the gradient began with that of other weights.
+    #[serde(default)]
+    inherited: bool,
     normalization: Normalization,
+    /// Number of the first object of the window that the next batch is drawn from.
+    #[serde(default)]
+    first_object: Option<u64>,
+    /// Objects before it that could not be read.
+    #[serde(default)]
+    broken: u64,
+    /// Steps whose loss or gradients were not finite.
+    #[serde(default)]
+    skipped: u64,
 }
 
 /// Weights that a new run starts from.
@@ -82,8 +101,10 @@ pub struct Trainer {
     progress: Progress,
     photometric: Photometric,
     stream: Stream,
-    window: VecDeque<Arc<Object>>,
+    broken: u64,                             // objects before those of the stream that could not be read
+    window: VecDeque<(u64, Arc<Object>)>,    // with their numbers
     ahead: Option<Result<Batch, FlowError>>, // of the next step
+    not_finite: u32,                         // steps in a row
     folder: PathBuf,
 }
 
@@ -106,7 +127,8 @@ impl Trainer {
         let source: Arc<dyn ObjectSource> = match &config.data.shards {
             Some(place) => {
                 let open = if config.data.partial { Shards::open_finished } else { Shards::open };
-                Arc::new(open(&Store::open(place)?, &config.depths(), Some(Split::Train))?)
+                let shards = open(&Store::open(place)?, &config.depths(), Some(Split::Train))?;
+                Arc::new(shards.shuffled_by(config.seed))
             }
             None => Arc::new(Generated {
                 config: config.data.object.clone(),
@@ -142,10 +164,8 @@ impl Trainer {
                 (progress, average, optimizer)
             }
             None => {
-                let mut square = [0.0; channel::COUNT];
                 if let Some(Initial { checkpoint, .. }) = initial {
                     model = Weights::of(&checkpoint.model).apply(model);
-                    square = checkpoint.gradient_rms.map(|x| x * x);
                 }
                 let normalization = match initial {
                     Some(Initial { checkpoint, remeasure: false }) => checkpoint.normalization.clone(),
@@ -161,18 +181,31 @@ impl Trainer {
                         }
                     }
                 };
-                let state = Progress { step: 0, seconds: 0.0, gradient_square: square, normalization };
+                // The gradient by normalised Gaussians grows with what they were divided by.
+                let square = |i: usize, old: &Checkpoint| {
+                    (old.gradient_rms[i] * normalization.std[i] / old.normalization.std[i]).powi(2)
+                };
+                let state = Progress {
+                    step: 0,
+                    seconds: 0.0,
+                    gradient_square: std::array::from_fn(|i| initial.map_or(0.0, |old| square(i, old.checkpoint))),
+                    inherited: initial.is_some(),
+                    normalization,
+                    first_object: Some(0),
+                    broken: 0,
+                    skipped: 0,
+                };
                 let average = Weights::of(&model);
                 let optimizer = AdamW::new(average.0.len());
                 (state, average, optimizer)
             }
         };
 
-        let first = state.step * config.data.fresh as u64;
+        let first = state.first_object.unwrap_or(state.step * config.data.fresh as u64);
         let mut stream = Stream::start(source, first, config.data.workers);
         progress(&format!("filling the window with {} objects", config.data.window));
-        let window = (0..config.data.window).map(|_| Ok(Arc::new(stream.take_next()?)));
-        let window = window.collect::<Result<VecDeque<_>, FlowError>>()?;
+        let window = (0..config.data.window).map(|_| stream.take_next().map(|(i, object)| (i, Arc::new(object))));
+        let window = window.collect::<Result<VecDeque<_>, _>>()?;
         Ok(Self {
             photometric: Photometric::new(&state.normalization, &plain),
             config,
@@ -180,10 +213,12 @@ impl Trainer {
             model: Some(model),
             average,
             optimizer,
-            progress: state,
+            broken: state.broken,
+            progress: Progress { first_object: Some(first), ..state },
             stream,
             window,
             ahead: None,
+            not_finite: 0,
             folder: folder.into(),
         })
     }
@@ -208,21 +243,26 @@ impl Trainer {
         let mut rng = step_rng(self.config.seed, index);
         let count = self.window.len();
         let chosen: Vec<Arc<Object>> = match stage.batch <= count {
-            true => sample_indices(&mut rng, count, stage.batch).into_iter().map(|i| self.window[i].clone()).collect(),
-            false => (0..stage.batch).map(|i| self.window[i % count].clone()).collect(),
+            true => {
+                sample_indices(&mut rng, count, stage.batch).into_iter().map(|i| self.window[i].1.clone()).collect()
+            }
+            false => (0..stage.batch).map(|i| self.window[i % count].1.clone()).collect(),
         };
         let model_config = ModelConfig { image_size: stage.image_size, ..self.config.model.clone() };
         let loss = &self.config.loss;
         let batch =
             Batch::draw(&chosen, stage, &model_config, loss, &self.progress.normalization, &mut rng, &self.device)?;
         for _ in 0..self.config.data.fresh {
-            self.window.push_back(Arc::new(self.stream.take_next()?));
+            let (i, object) = self.stream.take_next()?;
+            self.window.push_back((i, Arc::new(object)));
             self.window.pop_front();
         }
         Ok(batch)
     }
 
-    /// Takes one step.
+    /// Takes one step. A step whose loss or gradients are not finite changes no weights.
+    ///
+    /// After an error, too, [`save`](Self::save) keeps what was reached before it.
     pub fn step(&mut self) -> Result<Report, FlowError> {
         let begin = Instant::now();
         let index = self.progress.step;
@@ -236,6 +276,7 @@ impl Trainer {
         let losses = train::step(self.model(), batch, &self.photometric, &rms, &self.config.loss, &self.device)?;
         let mut gradients = Flat::of(&mut losses.total.clone().backward(), self.model());
         let norm = gradients.norm(&self.device);
+        let first_object = self.window.front().map(|(number, _)| *number);
         // A GPU has only been told by now what to do: the next batch is made while it works.
         if index + 1 < self.config.total_steps() {
             let begin = Instant::now();
@@ -247,28 +288,34 @@ impl Trainer {
         figures.extend(losses.gradient_square);
         let figures = Tensor::cat(figures, 0).into_data().try_to_vec::<f32>().map_err(|_| FlowError::NoGradient)?;
         let (&[total, flow, seen, held, norm], square) = figures.split_first_chunk().ok_or(FlowError::NoGradient)?;
-        self.require_finite("loss", total)?;
-        self.require_finite("norm of the gradients", norm)?;
         let o = &self.config.optimizer;
         let rate = o.rate(index, self.config.total_steps());
-        let step = Step {
-            time: index + 1,
-            rate,
-            clip: if norm > o.clip { o.clip / norm } else { 1.0 },
-            // The average follows closely at first, when the weights still move far.
-            ema: o.ema.min((1.0 + index as f32) / (10.0 + index as f32)),
-        };
-        let model = self.model.take().expect("a step gives it back");
-        self.model = Some(self.optimizer.step(model, gradients, &mut self.average, o, step));
-
-        // The mean of all steps so far until that is long enough to forget the oldest.
-        let decay = GRADIENT_STATISTIC_DECAY.min(index as f32 / (index as f32 + 1.0));
-        for (mine, new) in self.progress.gradient_square.iter_mut().zip(square) {
-            *mine = decay * *mine + (1.0 - decay) * new;
+        let finite = figures.iter().all(|x| x.is_finite());
+        if finite {
+            let applied = self.progress.step - self.progress.skipped;
+            let step = Step {
+                time: applied + 1,
+                rate,
+                clip: if norm > o.clip { o.clip / norm } else { 1.0 },
+                // The average follows closely at first, when the weights still move far.
+                ema: o.ema.min((1.0 + applied as f32) / (10.0 + applied as f32)),
+            };
+            let model = self.model.take().expect("a step gives it back");
+            self.model = Some(self.optimizer.step(model, gradients, &mut self.average, o, step));
+            self.follow(square);
         }
         let seconds = begin.elapsed().as_secs_f64();
-        self.progress.step += 1;
-        self.progress.seconds += seconds;
+        let p = &mut self.progress;
+        p.step += 1;
+        p.seconds += seconds;
+        p.skipped += u64::from(!finite);
+        p.first_object = first_object;
+        p.broken =
+            self.broken + self.stream.broken().iter().filter(|&&number| Some(number) < first_object).count() as u64;
+        self.not_finite = if finite { 0 } else { self.not_finite + 1 };
+        if self.not_finite == NOT_FINITE_IN_A_ROW {
+            return Err(FlowError::NotFinite { steps: self.not_finite, last: p.step, loss: total, norm });
+        }
         Ok(Report {
             step: self.progress.step,
             loss: total,
@@ -279,24 +326,28 @@ impl Trainer {
             learning_rate: rate,
             seconds,
             data_seconds,
+            skipped: self.progress.skipped,
+            broken: self.broken + self.stream.broken().len() as u64,
         })
+    }
+
+    /// Moves the averages after a step that was applied. `square`: the mean square of the gradient's channels in it.
+    fn follow(&mut self, square: &[f32]) {
+        let applied = (self.progress.step - self.progress.skipped) as f32;
+        // The mean of all steps so far until that is long enough to forget the oldest. What an initial checkpoint knows
+        // is worth as much from the start.
+        let decay = match self.progress.inherited {
+            true => GRADIENT_STATISTIC_DECAY,
+            false => GRADIENT_STATISTIC_DECAY.min(applied / (applied + 1.0)),
+        };
+        for (mine, new) in self.progress.gradient_square.iter_mut().zip(square) {
+            *mine = decay * *mine + (1.0 - decay) * new;
+        }
     }
 
     fn gradient_rms(&self) -> [f32; channel::COUNT] {
         // Before the first step nothing is known: one is as good as any, and the channels are clamped.
         self.progress.gradient_square.map(|x| if x > 0.0 { x.sqrt().max(1e-12) } else { 1.0 })
-    }
-
-    fn require_finite(&self, what: &str, value: f32) -> Result<(), FlowError> {
-        if value.is_finite() {
-            return Ok(());
-        }
-        Err(FlowError::NotFinite {
-            step: self.progress.step,
-            what: what.into(),
-            value,
-            state: latest_state(&self.folder)?.unwrap_or_else(|| self.folder.clone()),
-        })
     }
 
     /// Saves everything that [`Trainer::open`] needs to go on, and the checkpoint of the averaged weights beside it.
@@ -324,10 +375,13 @@ impl Trainer {
         let file = partial.join("progress.json");
         let text = serde_json::to_string_pretty(&self.progress).expect("plain numbers");
         std::fs::write(&file, text).map_err(io(&file))?;
+        sync_tree(&partial).map_err(io(&partial))?;
         if target.exists() {
             std::fs::remove_dir_all(&target).map_err(io(&target))?;
         }
         std::fs::rename(&partial, &target).map_err(io(&target))?;
+        // Not before the new state outlives a power cut may the older ones go.
+        sync_folder(&self.folder).map_err(io(&self.folder))?;
         for old in states(&self.folder)? {
             if old != target {
                 std::fs::remove_dir_all(&old).map_err(io(&old))?;
@@ -404,8 +458,11 @@ fn require_same_model(model: &ModelConfig, given: &ModelConfig) -> Result<(), Fl
 /// A run's folder holds its configuration: going on with another one would mix two runs.
 fn check_same_run(config: &TrainConfig, folder: &Path) -> Result<(), FlowError> {
     let path = folder.join("config.toml");
+    let mut kept = config.clone();
+    // Whoever reads that file, or goes on with the run from another folder, must find the same shards.
+    kept.data.shards = kept.data.shards.map(|place| local(&place, |path| std::path::absolute(path)));
     let text =
-        toml::to_string_pretty(config).map_err(|e| FlowError::State { path: path.clone(), problem: e.to_string() })?;
+        toml::to_string_pretty(&kept).map_err(|e| FlowError::State { path: path.clone(), problem: e.to_string() })?;
     match std::fs::read_to_string(&path) {
         Ok(old) => {
             let old: TrainConfig =
@@ -416,6 +473,7 @@ fn check_same_run(config: &TrainConfig, folder: &Path) -> Result<(), FlowError> 
                 c.stages.iter_mut().for_each(|s| s.steps = 0);
                 c.sample = Default::default();
                 c.data.workers = 0;
+                c.data.shards = c.data.shards.map(|place| local(&place, |path| path.canonicalize()));
                 c.optimizer.compute = Default::default();
                 c.optimizer.schedule = Default::default();
                 c
@@ -429,6 +487,12 @@ fn check_same_run(config: &TrainConfig, folder: &Path) -> Result<(), FlowError> 
         Err(source) => return Err(FlowError::Io { path, source }),
     }
     std::fs::write(&path, text).map_err(|source| FlowError::Io { path, source })
+}
+
+/// The path of a folder of shards otherwise said by `say`; URLs, and what cannot be said, as they are.
+fn local(place: &str, say: impl Fn(&Path) -> std::io::Result<PathBuf>) -> String {
+    let path = (!place.contains("://")).then(|| say(Path::new(place)).ok()).flatten();
+    path.and_then(|path| path.to_str().map(str::to_owned)).unwrap_or_else(|| place.to_owned())
 }
 
 fn states(folder: &Path) -> Result<Vec<PathBuf>, FlowError> {
@@ -449,3 +513,6 @@ fn states(folder: &Path) -> Result<Vec<PathBuf>, FlowError> {
 fn latest_state(folder: &Path) -> Result<Option<PathBuf>, FlowError> {
     Ok(states(folder)?.pop())
 }
+
+#[cfg(test)]
+mod tests;

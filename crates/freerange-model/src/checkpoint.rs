@@ -26,6 +26,8 @@ const FORMAT: &str = "freerange-checkpoint";
 /// The version that is written, and the only one that is read.
 const VERSION: &str = "1";
 const KIND: &str = "free-range checkpoint";
+/// Most Gaussians are 2 to this: a million.
+const MAX_DEPTH: u32 = 20;
 
 /// A trained model with everything that sampling needs.
 #[derive(Clone, Debug)]
@@ -186,16 +188,18 @@ impl Header {
         if !gradient_rms.iter().all(|x| x.is_normal() && *x > 0.0) {
             return Err(bad(format!("metadata `gradient_rms`: {gradient_rms:?}, expected positive numbers")));
         }
-        let depth = get("depth")?;
+        let text = get("depth")?;
+        // Sampling starts with noise for all Gaussians: what is impossible is refused before it fills the memory.
+        let depths = config.gaussians_per_token.ilog2()..=MAX_DEPTH;
+        let depth = text.parse().ok().filter(|d| depths.contains(d)).ok_or_else(|| {
+            let [first, last] = [depths.start(), depths.end()];
+            bad(format!("metadata `depth` is `{text}`, expected a whole number from {first} to {last}"))
+        })?;
         Ok(Self {
             config,
             gradient_rms,
             normalization: serde_json::from_str(get("normalization")?).map_err(|e| invalid("normalization", e))?,
-            depth: depth
-                .parse()
-                .ok()
-                .filter(|d| (0..=24).contains(d))
-                .ok_or_else(|| bad(format!("metadata `depth` is `{depth}`, expected a whole number up to 24")))?,
+            depth,
             provenance: serde_json::from_str(get("provenance")?).map_err(|e| invalid("provenance", e))?,
             encoder_weights: metadata
                 .get("encoder_weights")

@@ -4,7 +4,7 @@ use std::io::{self, BufWriter, Write};
 use std::{fs::File, path::Path};
 
 /// Writes a file beside `path` with `fill`, then renames it to `path`, replacing what is there. Where anything fails,
-/// or the process is killed, `path` stays as it was.
+/// the process is killed or the power goes, `path` stays as it was. Afterwards the new file outlives both.
 ///
 /// # Errors
 /// Those of `fill` and of the file system.
@@ -20,8 +20,33 @@ pub fn write_atomically(path: &Path, fill: impl FnOnce(&mut BufWriter<&File>) ->
     fill(&mut writer)?;
     writer.flush()?;
     drop(writer);
+    beside.as_file().sync_all()?;
     beside.persist(path)?;
-    Ok(())
+    sync_folder(folder)
+}
+
+/// Waits until the names in `folder` are permanent; those of files that were renamed into it, too, are so only then.
+///
+/// # Errors
+/// Those of the file system.
+pub fn sync_folder(folder: &Path) -> io::Result<()> {
+    // Not every system lets a folder be opened.
+    if cfg!(unix) { File::open(folder)?.sync_all() } else { Ok(()) }
+}
+
+/// Waits until `folder` with all files and folders in it is permanent.
+///
+/// # Errors
+/// Those of the file system.
+pub fn sync_tree(folder: &Path) -> io::Result<()> {
+    for entry in std::fs::read_dir(folder)? {
+        let path = entry?.path();
+        match path.is_dir() {
+            true => sync_tree(&path)?,
+            false => File::open(&path)?.sync_all()?,
+        }
+    }
+    sync_folder(folder)
 }
 
 #[cfg(test)]
@@ -39,5 +64,14 @@ mod tests {
         assert_eq!(std::fs::read(&path).unwrap(), b"new");
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
         assert!(write_atomically(&folder.path().join("none/a.txt"), |_| Ok(())).is_err());
+    }
+
+    #[test]
+    fn folders_are_synchronised_with_what_is_in_them() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::create_dir(folder.path().join("a")).unwrap();
+        std::fs::write(folder.path().join("a/b.txt"), b"b").unwrap();
+        sync_tree(folder.path()).unwrap();
+        sync_tree(&folder.path().join("none")).unwrap_err();
     }
 }

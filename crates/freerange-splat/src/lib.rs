@@ -17,7 +17,7 @@ mod tree;
 pub use align::Alignment;
 pub use cloud::{Cloud, channel};
 pub use error::SplatError;
-pub use file::write_atomically;
+pub use file::{sync_folder, sync_tree, write_atomically};
 pub use merge::{Gaussian, OPACITY_RANGE, merge};
 pub use normalize::{Normalization, STD_FLOOR, Statistics};
 pub use ply::{PlyFile, parse_ply, read_ply, write_ply};

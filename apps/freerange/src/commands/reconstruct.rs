@@ -201,7 +201,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     }
     let checkpoint = checkpoint(args.sampling.checkpoint.as_deref(), &device)?;
     let options = args.sampling.options(&checkpoint, args.samples, &device)?;
-    let output = OutputFolder::create(&args.output)?;
+    let output = OutputFolder::create("reconstruct", &args.output)?;
     let mut seconds = vec![("load", begin.elapsed().as_secs_f64())];
 
     let result = pipeline::run(&scene.inputs, &checkpoint, &options, &device)?;

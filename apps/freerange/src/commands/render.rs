@@ -27,7 +27,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         eprintln!("note: {note}");
     }
     let cameras = load_cameras(&args.cameras)?;
-    let output = OutputFolder::create(&args.output)?;
+    let output = OutputFolder::create("render", &args.output)?;
     let mut bar = Progress::new("rendering", cameras.len() as u64);
     for (i, (name, camera)) in cameras.iter().enumerate() {
         let picture = to_picture(&render_view(&cloud, camera)?, camera.width, camera.height);

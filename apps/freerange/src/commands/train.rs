@@ -1,10 +1,11 @@
 //! `freerange train`
 
-use std::{io::Write, path::PathBuf, time::Instant};
+use std::{path::PathBuf, time::Instant};
 
 use freerange_flow::{
     config::TrainConfig,
-    trainer::{Initial, Trainer},
+    log::Log,
+    trainer::{Initial, Report, Trainer},
 };
 
 use crate::{
@@ -34,7 +35,7 @@ pub struct Args {
     #[arg(long)]
     minutes: Option<f64>,
     /// Steps between two saved states.
-    #[arg(long, default_value_t = 250)]
+    #[arg(long, default_value_t = 250, value_parser = clap::value_parser!(u64).range(1..))]
     save_every: u64,
     /// Where to compute: auto, cpu, or cuda, metal, vulkan, webgpu with a number if there are several, as in cuda:1.
     #[arg(long, default_value = "auto")]
@@ -51,21 +52,26 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     let initial = args.initial.as_deref().map(|path| checkpoint(Some(path), &device)).transpose()?;
     let initial = initial.as_ref().map(|checkpoint| Initial { checkpoint, remeasure: args.remeasure });
     let mut trainer = Trainer::open(config, &args.output, initial, &device, |m| eprintln!("{m}"))?;
-    let path = args.output.join("log.jsonl");
-    let log = std::fs::File::options().create(true).append(true).open(&path);
-    let mut log = std::io::BufWriter::new(log.map_err(|e| CliError::file(&path, e))?);
+    let mut log = Log::open(&args.output.join("log.jsonl"), trainer.step_count())?;
     let mut bar = Progress::new("training", total);
     while trainer.step_count() < total {
-        let report = trainer.step()?;
-        let line = serde_json::to_string(&report).map_err(CliError::input)?;
-        writeln!(log, "{line}").map_err(|e| CliError::file(&path, e))?;
-        bar.at(
-            report.step,
-            &format!("loss {:.3} flow {:.3} held {:.4} {:.2} s", report.loss, report.flow, report.held, report.seconds),
-        );
+        let report = match trainer.step() {
+            Ok(report) => report,
+            Err(e) => {
+                // What was learned before is not lost; if it cannot be saved either, the first error is the one to tell.
+                let saved = log.sync().and_then(|()| trainer.save());
+                eprintln!(
+                    "{}",
+                    saved.map_or_else(|e| e.to_string(), |_| format!("saved step {}", trainer.step_count()))
+                );
+                return Err(e.into());
+            }
+        };
+        log.add(&report)?;
+        bar.at(report.step, &line(&report));
         let out_of_time = args.minutes.is_some_and(|m| begin.elapsed().as_secs_f64() > 60.0 * m);
         if report.step % args.save_every == 0 || report.step == total || out_of_time {
-            log.flush().map_err(|e| CliError::file(&path, e))?;
+            log.sync()?;
             trainer.save()?;
         }
         if out_of_time {
@@ -75,4 +81,16 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     bar.finish();
     println!("{} of {total} steps; {}", trainer.step_count(), args.output.join("checkpoint.safetensors").display());
     Ok(())
+}
+
+/// What the progress says of a step.
+fn line(report: &Report) -> String {
+    let Report { loss, flow, held, seconds, .. } = report;
+    let mut line = format!("loss {loss:.3} flow {flow:.3} held {held:.4} {seconds:.2} s");
+    for (count, what) in [(report.skipped, "steps not finite"), (report.broken, "objects unreadable")] {
+        if count > 0 {
+            line += &format!(", {count} {what}");
+        }
+    }
+    line
 }

@@ -127,20 +127,29 @@ fn what_many_objects_cost_is_measured() {
 }
 
 #[test]
-fn samples_come_in_one_shuffled_order_over_and_over() {
+fn samples_come_over_and_over_each_time_in_another_order() {
     let folder = tempfile::tempdir().unwrap();
     build_toys(folder.path(), &BuildOptions::default(), |_| Ok(30.0)).unwrap();
     let shards = open(folder.path(), &[2]).unwrap();
     assert_eq!(shards.len(), 10);
     let id = |i: u64| shards.object(i).unwrap().id;
-    let once: Vec<String> = (0..10).map(id).collect();
-    assert_eq!(once.iter().cloned().collect::<BTreeSet<_>>(), (7..17).map(|s| format!("generated-{s:08}")).collect());
-    assert!(!once.is_sorted(), "{once:?}");
-    assert_eq!((10..20).map(id).collect::<Vec<_>>(), once);
-    let far = u64::MAX - u64::MAX % 10;
-    assert_eq!(id(far), once[0]);
+    let all: BTreeSet<String> = (7..17).map(|s| format!("generated-{s:08}")).collect();
+    let last = (u64::MAX / 10 - 1) * 10;
+    let epochs = [0, 10, 20, last].map(|first| (first..first + 10).map(id).collect::<Vec<_>>());
+    for (i, epoch) in epochs.iter().enumerate() {
+        assert_eq!(epoch.iter().cloned().collect::<BTreeSet<_>>(), all, "all objects, each once");
+        assert!(!epoch.is_sorted(), "{epoch:?}");
+        assert!(epochs[..i].iter().all(|other| other != epoch), "{epochs:?}");
+    }
+    // The same from any number on, and in any order of asking.
     let again = open(folder.path(), &[2]).unwrap();
-    assert_eq!((0..10).map(|i| again.object(i).unwrap().id).collect::<Vec<_>>(), once);
+    let id = |i: u64| again.object(i).unwrap().id;
+    assert_eq!(
+        (id(23), id(last), id(5), id(14)),
+        (epochs[2][3].clone(), epochs[3][0].clone(), epochs[0][5].clone(), epochs[1][4].clone())
+    );
+    let other = open(folder.path(), &[2]).unwrap().shuffled_by(1234);
+    assert_ne!((0..10).map(|i| other.object(i).unwrap().id).collect::<Vec<_>>(), epochs[0]);
 }
 
 #[test]
@@ -279,7 +288,12 @@ fn failing_objects_are_recorded_and_the_rest_goes_on() {
     let summary = build_toys(folder.path(), &BuildOptions::default(), |_| panic!("nothing to do")).unwrap();
     assert_eq!((summary.made, summary.skipped, summary.failures.len()), (0, 10, 4));
     let again = BuildOptions { retry_failed: true, ..BuildOptions::default() };
-    assert_eq!(build_toys(folder.path(), &again, |_| Ok(30.0)).unwrap().failures, []);
+    let summary = build_toys(folder.path(), &again, |seed| match [8, 12, 13, 16].contains(&seed) {
+        true => Ok(30.0),
+        false => panic!("{seed} is there"),
+    });
+    let summary = summary.unwrap();
+    assert_eq!((summary.made, summary.skipped, summary.failures), (4, 6, Vec::new()));
     let whole = tempfile::tempdir().unwrap();
     build_toys(whole.path(), &BuildOptions::default(), |_| Ok(30.0)).unwrap();
     assert_eq!(contents(folder.path()), contents(whole.path()));

@@ -57,9 +57,8 @@ fn toy(seed: u64) -> Object {
     let mut cloud = |n: usize| Cloud::from_rows((0..n * channel::COUNT).map(|_| rng.random_range(-1.0..1.0)).collect());
     let slices = BTreeMap::from([(2, cloud(4)), (3, cloud(8))]);
     // Numbers that 16 bits hold.
-    let fit = Cloud::from_rows((0..4 * channel::COUNT).map(|_| f32::from(rng.random::<i8>()) / 64.0).collect());
-    let input_fits =
-        vec![InputFit { views: vec![1], gaussians: fit.clone() }, InputFit { views: vec![1, 0], gaussians: fit }];
+    let mut fit = || Cloud::from_rows((0..4 * channel::COUNT).map(|_| f32::from(rng.random::<i8>()) / 64.0).collect());
+    let input_fits = [vec![1], vec![1, 0]].map(|views| InputFit { views, gaussians: fit(), mended: fit() }).to_vec();
     Object { id: generated_id(seed), views, slices, input_fits }
 }
 

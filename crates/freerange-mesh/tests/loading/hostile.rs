@@ -1,7 +1,5 @@
 //! Files that are broken, lie about their sizes, or ask for too much.
 
-use std::time::Instant;
-
 use freerange_mesh::{LoadLimits, MeshError, MeshFormat, load_mesh, load_mesh_bytes};
 use image::ImageFormat;
 use serde_json::json;
@@ -157,7 +155,6 @@ fn instances_count_towards_the_limits() {
 
 #[test]
 fn a_thousand_million_vertices_are_not_allocated() {
-    let start = Instant::now();
     for count in [1_000_000_000u64, u64::from(u32::MAX), 1 << 60] {
         let mut glb = Glb::new();
         glb.json["accessors"] = json!([{"componentType": F32, "type": "VEC3", "count": count}]);
@@ -172,7 +169,6 @@ fn a_thousand_million_vertices_are_not_allocated() {
         *glb.primitive("indices") = json!(1);
         assert_names(&glb.error(), &["indices", "max_triangles"]);
     }
-    assert!(start.elapsed().as_secs() < 2);
 }
 
 #[test]

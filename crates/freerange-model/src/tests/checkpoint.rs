@@ -179,6 +179,8 @@ fn hostile_files_are_refused_by_name() {
         (tampered(&path, meta("version", "2")), "version is `2`"),
         (tampered(&path, meta("depth", "-1")), "`depth` is `-1`"),
         (tampered(&path, meta("depth", "60")), "`depth` is `60`"),
+        (tampered(&path, meta("depth", "21")), "from 1 to 20"), // two Gaussians are one token
+        (tampered(&path, meta("depth", "0")), "`depth` is `0`"),
         (tampered(&path, meta("config", "{")), "`config`"),
         (tampered(&path, meta("config", big)), "expected [32, 16384]"),
         (tampered(&path, meta("config", endless)), "`blocks`"),

@@ -29,7 +29,8 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     for index in 0..items.len() {
         let Some(item) = items.get(index) else { break };
         let (views, sets) = render_views(&item, &config)?;
-        let output = OutputFolder::create(&if single { args.output.clone() } else { args.output.join(&item.id) })?;
+        let folder = if single { args.output.clone() } else { args.output.join(&item.id) };
+        let output = OutputFolder::create("data views", &folder)?;
         for view in &views {
             output.picture(&image_name(view), &view.image)?;
         }

@@ -1,0 +1,104 @@
+//! The log of a training run: JSON lines that never say a step twice.
+
+use std::{
+    fs::File,
+    io::{BufWriter, Write},
+    path::{Path, PathBuf},
+};
+
+use freerange_splat::write_atomically;
+
+use crate::FlowError;
+
+/// `log.jsonl` of a run, open for further lines. Every line has a field `step`.
+#[derive(Debug)]
+pub struct Log {
+    path: PathBuf,
+    file: BufWriter<File>,
+}
+
+impl Log {
+    /// Opens the log of a run that is at `step`. Lines of later steps, which a killed process took without saving their
+    /// state, and a line that it did not finish go away.
+    ///
+    /// # Errors
+    /// [`FlowError::Io`].
+    pub fn open(path: &Path, step: u64) -> Result<Self, FlowError> {
+        let io = |source| FlowError::Io { path: path.into(), source };
+        let old = match std::fs::read(path) {
+            Ok(old) => old,
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => Vec::new(),
+            Err(e) => return Err(io(e)),
+        };
+        let kept: Vec<&[u8]> = old.split_inclusive(|&b| b == b'\n').filter(|line| is_of(line, step)).collect();
+        if kept.iter().map(|line| line.len()).sum::<usize>() < old.len() {
+            write_atomically(path, |file| kept.iter().try_for_each(|line| file.write_all(line))).map_err(io)?;
+        }
+        let file = File::options().create(true).append(true).open(path).map_err(io)?;
+        Ok(Self { path: path.into(), file: BufWriter::new(file) })
+    }
+
+    /// Adds a line.
+    ///
+    /// # Errors
+    /// [`FlowError::Io`].
+    pub fn add(&mut self, line: &impl serde::Serialize) -> Result<(), FlowError> {
+        let added = serde_json::to_writer(&mut self.file, line).map_err(std::io::Error::from);
+        added.and_then(|()| self.file.write_all(b"\n")).map_err(|e| self.failed(e))
+    }
+
+    /// Makes the lines so far permanent.
+    ///
+    /// # Errors
+    /// [`FlowError::Io`].
+    pub fn sync(&mut self) -> Result<(), FlowError> {
+        let done = self.file.flush().and_then(|()| self.file.get_ref().sync_data());
+        done.map_err(|e| self.failed(e))
+    }
+
+    fn failed(&self, source: std::io::Error) -> FlowError {
+        FlowError::Io { path: self.path.clone(), source }
+    }
+}
+
+/// Whether this is a whole line of a step up to `last`.
+fn is_of(line: &[u8], last: u64) -> bool {
+    #[derive(serde::Deserialize)]
+    struct Step {
+        step: u64,
+    }
+    line.ends_with(b"\n") && serde_json::from_slice::<Step>(line).is_ok_and(|found| found.step <= last)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_resumed_log_says_every_step_once_and_whole() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("log.jsonl");
+        let line = |step: u64| serde_json::json!({ "step": step, "loss": 0.5 });
+        let mut log = Log::open(&path, 0).unwrap();
+        (1..=3).for_each(|step| log.add(&line(step)).unwrap());
+        log.sync().unwrap();
+        let saved = std::fs::read(&path).unwrap();
+        // Killed after two steps more, in the middle of a line.
+        log.add(&line(4)).unwrap();
+        drop(log);
+        let mut torn = std::fs::read(&path).unwrap();
+        torn.extend(b"{\"step\":2,\"lo");
+        std::fs::write(&path, torn).unwrap();
+
+        let mut log = Log::open(&path, 3).unwrap();
+        assert_eq!(std::fs::read(&path).unwrap(), saved);
+        log.add(&line(4)).unwrap();
+        drop(log);
+        let text = std::fs::read_to_string(&path).unwrap();
+        let steps: Vec<u64> = text
+            .lines()
+            .map(|l| serde_json::from_str::<serde_json::Value>(l).unwrap()["step"].as_u64().unwrap())
+            .collect();
+        assert_eq!(steps, [1, 2, 3, 4]);
+    }
+}
