@@ -66,6 +66,7 @@ fn end_with_a_closed_pipe() {
 fn main() -> ExitCode {
     #[cfg(unix)]
     end_with_a_closed_pipe();
+    freerange_model::keep_freed_memory();
     let cli = Cli::parse();
     // CubeCL tries several kernels for each job and reports each that a device cannot run; what matters ends as an error.
     let level = if cli.verbose { "debug" } else { "warn,cubecl_runtime=off,cubecl_wgpu=off" };

@@ -11,6 +11,7 @@ use freerange_flow::{
 };
 
 fn main() {
+    freerange_model::keep_freed_memory();
     let arguments: Vec<String> = std::env::args().collect();
     let path = arguments.get(1).map_or("configs/tiny.toml", String::as_str);
     let steps: u64 = arguments.get(2).map_or(20, |s| s.parse().expect("a number of steps"));

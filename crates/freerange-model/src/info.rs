@@ -379,6 +379,7 @@ mod tests {
                 position_features: 8,
                 final_layer,
                 gradient_channels,
+                ..ModelConfig::default()
             };
             let real: Vec<TensorInfo> =
                 model(&config).parameters().into_iter().map(|p| TensorInfo { name: p.name, shape: p.shape }).collect();
@@ -459,6 +460,7 @@ mod tests {
             position_features: 0,
             final_layer: FinalLayer::Linear,
             gradient_channels: true,
+            ..ModelConfig::default()
         };
         let info = ModelInfo::new(&config, Workload { batch: 1, views: 1, gaussians: 4 });
         let inputs = 57 * 2 + 2 * 56 * 2;

@@ -12,6 +12,7 @@ mod error;
 mod info;
 mod kernels;
 mod layers;
+mod memory;
 mod model;
 mod ops;
 #[cfg(test)]
@@ -25,5 +26,6 @@ pub use encoder::{Dinov2, ImageEncoder, WeightsOrigin, position_embedding};
 pub use error::ModelError;
 pub use info::{Execution, ModelInfo, PartInfo, TensorInfo, Workload, dinov2_parameters, tensors};
 pub use layers::{Linear, NormWeight};
+pub use memory::keep_freed_memory;
 pub use model::{FreeRange, Parameter};
 pub use ops::Compute;

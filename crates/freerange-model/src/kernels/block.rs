@@ -1,7 +1,8 @@
 //! A whole transformer block, forward and backward, from the operations of [`Kernels`].
 //!
 //! One operation instead of nine lets the backward pass start from the block's input alone (gradient checkpointing),
-//! lets biases be added where their products are read (and have their gradients from there), and writes the six parts of the modulation's gradient once.
+//! lets biases be added where their products are read (which is where their gradients come from), and writes the six parts
+//! of the modulation's gradient once.
 
 use burn::{
     backend::{Backend, ExtensionType, TensorMetadata, tensor::FloatTensor},

@@ -117,7 +117,7 @@ fn product(shape @ [m, k, n]: [usize; 3], a: Matrix, b: Matrix, bias: Option<&[f
 }
 
 /// Rows per piece of work; fixed, so that sums do not depend on the number of threads.
-const ROWS: usize = 64;
+pub const ROWS: usize = 32;
 
 pub fn forward(x: FlexTensor, w: FlexTensor, b: FlexTensor, bf16: bool) -> FlexTensor {
     let (x, w, b) = (contiguous(x), contiguous(w), contiguous(b));
@@ -162,8 +162,14 @@ pub fn bias(grad: &FlexTensor) -> FlexTensor {
         sums
     }
     let grad = contiguous(grad.clone());
-    let width = *grad.layout().shape().to_vec().last().expect("has axes");
-    let pieces: Vec<Vec<f32>> = values(&grad).par_chunks(ROWS * width).map(|rows| sums(rows, width)).collect();
+    let shape = grad.layout().shape().to_vec();
+    let [.., tokens, width] = shape[..] else { panic!("a linear layer's result has two axes or more") };
+    // The same pieces as of the pointwise operations, so that their sums are the same to the bit.
+    let pieces: Vec<Vec<f32>> = values(&grad)
+        .par_chunks((tokens * width).max(1))
+        .flat_map(|rows| rows.par_chunks(ROWS * width))
+        .map(|rows| sums(rows, width))
+        .collect();
     let mut total = vec![0f32; width];
     pieces.iter().for_each(|piece| math::add(&mut total, piece));
     tensor(total, &[width])

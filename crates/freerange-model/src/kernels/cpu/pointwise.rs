@@ -7,11 +7,8 @@ use burn::backend::flex::FlexTensor;
 use multiversion::multiversion;
 use rayon::prelude::*;
 
-use super::{contiguous, dims, into_values, math, tensor, values};
+use super::{contiguous, dims, into_values, linear::ROWS, math, tensor, values};
 use crate::ops::EPS;
-
-/// Rows per piece of work; fixed, so that sums do not depend on the number of threads.
-const ROWS: usize = 32;
 
 /// Calls `f(first row, rows of out)` for pieces of `ROWS` rows that do not cross batch elements, in parallel, and
 /// collects what it returns: `[b][pieces per batch element]`.
@@ -90,6 +87,7 @@ fn norm_rows_backward(
     d_scale: &mut [f32],
 ) {
     let width = scale.len();
+    let (d_shift, d_scale) = (&mut d_shift[..width], &mut d_scale[..width]);
     let mut h = vec![0f32; width];
     for ((x, grad), dx) in x.chunks_exact(width).zip(grad.chunks_exact(width)).zip(dx.chunks_exact_mut(width)) {
         let (mean, inverse) = statistics(x);
@@ -161,6 +159,7 @@ fn gated_rows(x: &[f32], gate: &[f32], y: &[f32], out: &mut [MaybeUninit<f32>]) 
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma"))]
 fn gated_rows_backward(gate: &[f32], y: &mut [f32], grad: &[f32], d_gate: &mut [f32], d_bias: &mut [f32]) {
     let width = gate.len();
+    let (d_gate, d_bias) = (&mut d_gate[..width], &mut d_bias[..width]);
     for (y, grad) in y.chunks_exact_mut(width).zip(grad.chunks_exact(width)) {
         for i in 0..width {
             let dy = gate[i] * grad[i];
@@ -224,7 +223,8 @@ fn geglu_rows(x: &[f32], out: &mut [MaybeUninit<f32>], f: usize) {
 /// Turns `x` into its gradient, and adds to that of its bias. gelu(g) = g P(g), so gelu'(g) = P(g) + g p(g).
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma"))]
 fn geglu_rows_backward(x: &mut [f32], grad: &[f32], d_bias: &mut [f32], f: usize) {
-    let (a_bias, g_bias) = d_bias.split_at_mut(f);
+    // Lengths that the compiler knows to be the same: what is checked number by number is not computed in vectors.
+    let (a_bias, g_bias) = d_bias[..2 * f].split_at_mut(f);
     for (x, grad) in x.chunks_exact_mut(2 * f).zip(grad.chunks_exact(f)) {
         let (a, g) = x.split_at_mut(f);
         for i in 0..f {
@@ -258,14 +258,11 @@ pub fn geglu_backward(x: FlexTensor, grad: FlexTensor) -> [FlexTensor; 2] {
     let shape @ [_, _, f2] = dims(&x);
     let f = f2 / 2;
     let mut dx = into_values(x);
-    let sums: Vec<Vec<f32>> = dx
-        .par_chunks_mut(ROWS * f2)
-        .zip(values(&grad).par_chunks(ROWS * f))
-        .map(|(x, grad)| {
-            let mut d_bias = vec![0f32; f2];
-            geglu_rows_backward(x, grad, &mut d_bias, f);
-            d_bias
-        })
-        .collect();
-    [tensor(dx, &shape), bias(sums.into_iter(), f2)]
+    let grads = values(&grad);
+    let sums = pieces(&mut dx, shape, |_, row, x| {
+        let mut d_bias = vec![0f32; f2];
+        geglu_rows_backward(x, &grads[row * f..][..x.len() / 2], &mut d_bias, f);
+        d_bias
+    });
+    [tensor(dx, &shape), bias(sums.into_iter().flatten(), f2)]
 }
