@@ -4,7 +4,7 @@ use std::{ops::ControlFlow, time::Instant};
 
 use burn::tensor::Device;
 use freerange_camera::{CanonicalFrame, FrameConfig, Similarity, Up, View, canonical_from_user, image_ops::composite};
-use freerange_fit::{RefineConfig, quick_fit, refine, tree_slice};
+use freerange_fit::{RefineConfig, frame_of, quick_fit, refine, tree_slice};
 use freerange_flow::sample::{SampleConfig, reconstruct};
 use freerange_metrics::{psnr, ssim_3dgs};
 use freerange_model::Checkpoint;
@@ -65,7 +65,7 @@ pub fn run(
 ) -> Result<Reconstruction, CliError> {
     let mut seconds = Vec::new();
     let begin = Instant::now();
-    let (frame, canonical) = to_canonical(views, options.up)?;
+    let (mut frame, mut canonical) = to_canonical(views, options.up)?;
     seconds.push(("frame", begin.elapsed().as_secs_f64()));
 
     let begin = Instant::now();
@@ -77,11 +77,20 @@ pub fn run(
         None => None,
         Some(start) => {
             let mut bar = bar("fitting", start.fit.iterations);
-            let fit = quick_fit(&canonical, &start.fit, 0, |p| {
+            let mut fit = quick_fit(&canonical, &start.fit, 0, |p| {
                 bar.at(p.step as u64, &format!("loss {:.4}", p.loss));
                 ControlFlow::Continue(())
             })?;
             bar.finish();
+            // The fit knows better than the masks where the object is; it moves along, so that one is enough.
+            if !frame.kept {
+                let correction = frame_of(&fit, &canonical)?;
+                fit.transform(correction.scale, correction.rotation, correction.translation);
+                canonical = moved(&canonical, &correction);
+                frame.canonical_from_user = correction.after(&frame.canonical_from_user);
+                let (shift, scale) = (correction.translation.length(), correction.scale);
+                frame.notes.push(format!("the quick fit moved it by {shift:.3} and scaled it by {scale:.3}"));
+            }
             seconds.push(("fit", begin.elapsed().as_secs_f64()));
             Some([fit])
         }
@@ -132,9 +141,12 @@ pub fn run(
 /// The views in the canonical frame, and how they got there.
 pub fn to_canonical(views: &[View], up: Up) -> Result<(CanonicalFrame, Vec<View>), CliError> {
     let frame = canonical_from_user(views, &FrameConfig { up, ..FrameConfig::default() })?;
-    let moved = |v: &View| View { camera: v.camera.transformed(&frame.canonical_from_user), ..v.clone() };
-    let canonical = views.iter().map(moved).collect();
+    let canonical = moved(views, &frame.canonical_from_user);
     Ok((frame, canonical))
+}
+
+fn moved(views: &[View], to: &Similarity) -> Vec<View> {
+    views.iter().map(|v| View { camera: v.camera.transformed(to), ..v.clone() }).collect()
 }
 
 /// Takes a cloud from the canonical frame to the user's.

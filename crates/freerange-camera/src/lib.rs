@@ -12,7 +12,7 @@ mod selection;
 
 pub use camera::{Camera, View};
 pub use error::{CameraError, Place};
-pub use frame::{CanonicalFrame, FrameConfig, Similarity, Up, canonical_from_user};
+pub use frame::{CANONICAL_RADIUS, CanonicalFrame, FrameConfig, Similarity, Up, canonical_from_user, outline_radius};
 pub use plucker::{PatchLayout, plucker};
 pub use scene::{Scene, load_cameras, transforms_json};
 pub use selection::{SelectionConfig, ViewSets, inputs_around, inputs_beside, k_means, select_views};

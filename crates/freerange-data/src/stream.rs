@@ -113,7 +113,12 @@ mod tests {
         fn object(&self, index: u64) -> Result<Object, DataError> {
             match self.0(index) {
                 true => Err(DataError::File { path: "shard".into(), problem: format!("no object {index}") }),
-                false => Ok(Object { id: index.to_string(), slices: Default::default(), views: Vec::new() }),
+                false => Ok(Object {
+                    id: index.to_string(),
+                    slices: Default::default(),
+                    views: Vec::new(),
+                    input_fits: Vec::new(),
+                }),
             }
         }
     }

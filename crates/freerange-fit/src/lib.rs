@@ -1,6 +1,7 @@
 //! 3DGS-MCMC: posed views in, 3D Gaussians out.
 //!
 //! * [`fit`]: from nothing but views (Kheradmand et al. 2024), which is how training objects become clouds.
+//! * [`frame_of`]: where a fit says the object is.
 //! * [`refine`]: the same from a cloud that is already good, held where no view looks.
 //!
 //! Plain Rust over the rasteriser's CPU functions; no tensor library.
@@ -9,6 +10,7 @@ mod adam;
 mod config;
 mod error;
 mod fit;
+mod frame;
 mod hold;
 mod init;
 mod mcmc;
@@ -22,6 +24,7 @@ mod views;
 pub use config::{Background, FitConfig, HoldConfig, Rates, RefineConfig};
 pub use error::FitError;
 pub use fit::fit;
+pub use frame::frame_of;
 pub use quick::{QuickFitConfig, quick_fit, tree_slice};
 pub use refine::refine;
 

@@ -109,6 +109,7 @@ fn euler_with_both_guidances_on_the_toy_model() {
         let mut estimates = Vec::new();
         let last = integrate(
             noise,
+            0.0,
             steps,
             Solver::Euler,
             |step| {

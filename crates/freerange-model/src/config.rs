@@ -41,9 +41,11 @@ pub struct ModelConfig {
     /// Whether an earlier estimate of the clean Gaussians is one, too (self-conditioning: Chen et al. 2022; not the
     /// paper's). Without one, zeros stand for it.
     pub estimate_channels: bool,
-    /// Whether the last layer tells but the correction, of unit variance at all times, to what the noisy Gaussians and the
-    /// earlier estimate say together (preconditioning: Karras et al. 2022; not the paper's).
-    pub preconditioned: bool,
+    /// With these, the last layer tells but the correction, of unit variance at all times, to what the noisy Gaussians and
+    /// the earlier estimate say together (preconditioning: Karras et al. 2022; not the paper's): standard deviations, one
+    /// per channel, of what such estimates are off by, in normalised units. Without an estimate they are 1.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub preconditioning: Option<[f32; CHANNELS]>,
 }
 
 /// How images become tokens.
@@ -122,7 +124,7 @@ impl Default for ModelConfig {
             final_layer: FinalLayer::Adaln,
             gradient_channels: true,
             estimate_channels: false,
-            preconditioned: false,
+            preconditioning: None,
         }
     }
 }
@@ -262,6 +264,12 @@ impl ModelConfig {
         }
         if ![1, 2, 4, 8].contains(&self.gaussians_per_token) {
             return Err(ModelError::config("gaussians_per_token", "1, 2, 4 or 8", self.gaussians_per_token));
+        }
+        if let Some(deviations) = self.preconditioning
+            && !deviations.iter().all(|d| (1e-3..=1e3).contains(d))
+        {
+            let found = format!("{deviations:?}");
+            return Err(ModelError::config("preconditioning", "14 numbers between 0.001 and 1000", found));
         }
         match &self.encoder {
             EncoderConfig::Patch(c) => {

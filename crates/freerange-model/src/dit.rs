@@ -28,8 +28,9 @@ pub struct Dit {
     gaussians_per_token: usize,
     gradient_channels: bool,
     estimate_channels: bool,
-    preconditioned: bool,
     time_features: usize,
+    #[module(skip)]
+    preconditioning: Option<[f32; CHANNELS]>,
     #[module(skip)]
     compute: Compute,
     #[module(skip)]
@@ -195,20 +196,30 @@ impl Parts {
     }
 }
 
-/// What `noisy`, at time `t`, tells of clean Gaussians that are normal about `estimate` (zeros if none) with unit variance:
-/// their mean `[b, n, 14]` and their standard deviation `[b, 1, 1]`.
+/// What `noisy`, at time `t`, tells of clean Gaussians that are normal about `estimate` with standard `deviations`, or
+/// without an estimate about zero with deviation 1: their mean and their deviation, both `[b, n, 14]` or broadcast to it.
 ///
-/// With `z = t x + (1 - t) eps` these are `e + t (z - t e) / v` and `(1 - t) / sqrt(v)`, where `v = t^2 + (1 - t)^2`.
-fn best_linear(noisy: Tensor<3>, estimate: Option<Tensor<3>>, t: Tensor<1>) -> (Tensor<3>, Tensor<3>) {
+/// With `z = t x + (1 - t) eps` and deviation s of x these are `e + t s^2 (z - t e) / v` and `s (1 - t) / sqrt(v)`, where
+/// `v = t^2 s^2 + (1 - t)^2`.
+fn best_linear(
+    noisy: Tensor<3>,
+    estimate: Option<Tensor<3>>,
+    deviations: [f32; CHANNELS],
+    t: Tensor<1>,
+) -> (Tensor<3>, Tensor<3>) {
     let t = t.unsqueeze_dims::<3>(&[1, 2]); // [b, 1, 1]
     let rest = t.clone().neg().add_scalar(1.0);
-    let variance = t.clone().square() + rest.clone().square();
-    let deviation = rest / variance.clone().sqrt();
-    let mean = noisy * (t / variance);
-    match estimate {
-        Some(estimate) => (mean + estimate * deviation.clone().square(), deviation),
-        None => (mean, deviation),
-    }
+    let deviations = if estimate.is_some() { deviations } else { [1.0; CHANNELS] };
+    let s = Tensor::<1>::from_floats(deviations, &noisy.device()).reshape([1, 1, CHANNELS]);
+    let signal = t.clone() * s.clone(); // [b, 1, 14]
+    let variance = signal.clone().square() + rest.clone().square();
+    let gain = signal * s.clone() / variance.clone();
+    let deviation = rest * s / variance.sqrt();
+    let mean = match estimate {
+        Some(estimate) => estimate.clone() + (noisy - estimate * t) * gain,
+        None => noisy * gain,
+    };
+    (mean, deviation)
 }
 
 /// `[b, n d]` to n times `[b, d]`.
@@ -248,7 +259,7 @@ impl Dit {
             gaussians_per_token: config.gaussians_per_token,
             gradient_channels: config.gradient_channels,
             estimate_channels: config.estimate_channels,
-            preconditioned: config.preconditioned,
+            preconditioning: config.preconditioning,
             time_features: config.time_features,
             compute: Compute::F32,
             recompute: false,
@@ -350,7 +361,7 @@ impl Dit {
         let [b, n, _] = noisy.dims();
         let gaussian_tokens = n / self.gaussians_per_token;
         let feedback = feedback.into();
-        let known = self.preconditioned.then(|| best_linear(noisy.clone(), feedback.estimate.clone(), t.clone()));
+        let known = self.preconditioning.map(|d| best_linear(noisy.clone(), feedback.estimate.clone(), d, t.clone()));
         let mut x = self.tokens(noisy, feedback, image_tokens);
         let silu_c = silu(self.condition(t)); // [b, d]
         for (i, block) in self.blocks.iter().enumerate() {

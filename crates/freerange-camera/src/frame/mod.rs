@@ -51,6 +51,8 @@ impl Default for FrameConfig {
 pub struct CanonicalFrame {
     /// From the user's frame to the canonical one.
     pub canonical_from_user: Similarity,
+    /// Whether the scene was in the canonical frame already, so that place and scale are kept, not estimated.
+    pub kept: bool,
     /// What was found, for the user to read.
     pub notes: Vec<String>,
 }
@@ -75,7 +77,7 @@ pub fn canonical_from_user(views: &[View], config: &FrameConfig) -> Result<Canon
     if config.keep_canonical && is_canonical(views, &silhouettes) {
         notes.push("the scene already is in the canonical frame: place and scale are kept".into());
         let canonical_from_user = Similarity { rotation, ..Similarity::IDENTITY };
-        return Ok(CanonicalFrame { canonical_from_user, notes });
+        return Ok(CanonicalFrame { canonical_from_user, kept: true, notes });
     }
 
     let axes: Vec<(DVec3, DVec3)> = views.iter().map(optical_axis).collect();
@@ -97,7 +99,15 @@ pub fn canonical_from_user(views: &[View], config: &FrameConfig) -> Result<Canon
     let rounded = |v: f64| (v * 1e4).round() / 1e4;
     let (x, y, z) = (rounded(centre.x), rounded(centre.y), rounded(centre.z));
     notes.push(format!("the object was found at ({x}, {y}, {z}) with radius {}", rounded(radius)));
-    Ok(CanonicalFrame { canonical_from_user: Similarity { scale, rotation, translation }, notes })
+    let canonical_from_user = Similarity { scale, rotation, translation };
+    Ok(CanonicalFrame { canonical_from_user, kept: false, notes })
+}
+
+/// The least radius of a sphere about `centre` that reaches all outlines of the views' masks; none with fewer than two
+/// masks. In the views' lengths.
+pub fn outline_radius(views: &[View], centre: DVec3) -> Option<f64> {
+    let silhouettes: Vec<Silhouette> = views.iter().filter_map(Silhouette::of).collect();
+    (silhouettes.len() >= 2).then(|| silhouettes.iter().map(|s| s.radius(centre)).fold(0.0, f64::max))
 }
 
 fn optical_axis(view: &View) -> (DVec3, DVec3) {

@@ -1,5 +1,6 @@
 use std::path::{Path, PathBuf};
 
+use freerange_splat::channel;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -102,6 +103,12 @@ fn messages_name_shard_object_and_entry() {
     };
     refused(&edit(0, "generated-00000001", "generated-00000002"), "json", "generated-00000002");
     refused(&edit(0, "\"seed\"", "\"sead\""), "json", "sead");
+    let outside = |e: &mut Entries| {
+        let mut metadata: serde_json::Value = serde_json::from_slice(&e[0].1).unwrap();
+        metadata["input_fits"] = serde_json::json!([[1], [2]]);
+        e[0].1 = serde_json::to_vec(&metadata).unwrap();
+    };
+    refused(&outside, "json", "[2]");
     refused(&edit(1, "opencv", "opengl"), "cameras.json", "opengl");
     refused(&edit(1, "\"width\":6", "\"width\":0"), "cameras.json", "0 x 4");
     refused(&edit(1, "\"width\":6", "\"width\":4000000000"), "cameras.json", "4000000000 x 4");
@@ -109,11 +116,21 @@ fn messages_name_shard_object_and_entry() {
     refused(&edit(1, "\"cx\":2.7", "\"cx\":null"), "cameras.json", "null");
     refused(&|e| e[2].1[0] = 0xff, "gaussians.safetensors", "safetensors");
     refused(&|e| e[2].1.truncate(100), "gaussians.safetensors", "safetensors");
-    let nan = |e: &mut Entries| {
-        let end = e[2].1.len();
-        e[2].1[end - 4..].copy_from_slice(&f32::NAN.to_le_bytes());
+    // The slices in 32 bits come first, then two fits, as they are and mended, of four Gaussians in 16 bits each.
+    let fits = 4 * 4 * channel::COUNT * 2;
+    let nan = |after: usize| {
+        move |e: &mut Entries| {
+            let end = e[2].1.len() - after;
+            e[2].1[end - 4..end].copy_from_slice(&f32::NAN.to_le_bytes());
+        }
     };
-    refused(&nan, "gaussians.safetensors", "depth_03");
+    refused(&nan(0), "gaussians.safetensors", "input_fit_01_mended");
+    refused(&nan(fits), "gaussians.safetensors", "depth_03");
+    let unnamed = |e: &mut Entries| {
+        let at = e[2].1.windows(14).position(|w| w == b"\"input_fit_01\"").unwrap();
+        e[2].1[at + 1..at + 13].copy_from_slice(b"input_fit_77");
+    };
+    refused(&unnamed, "gaussians.safetensors", "input_fit_01");
     let other = |o: &mut Entries, pixels: image::DynamicImage| {
         let mut png = std::io::Cursor::new(Vec::new());
         pixels.write_to(&mut png, image::ImageFormat::Png).unwrap();
