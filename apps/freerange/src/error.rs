@@ -95,7 +95,19 @@ impl From<FlowError> for CliError {
     fn from(e: FlowError) -> Self {
         match e {
             FlowError::Data(e) => e.into(),
-            FlowError::NotFinite { .. } | FlowError::NoGradient => Self::failure(e),
+            FlowError::NotFinite { .. } | FlowError::NoGradient | FlowError::Cancelled => Self::failure(e),
+            _ => Self { code: code_of(&e), source: e.into() },
+        }
+    }
+}
+
+impl From<freerange::Error> for CliError {
+    fn from(e: freerange::Error) -> Self {
+        use freerange::Error as E;
+        match e {
+            E::Flow(e) => e.into(),
+            E::Fit(e) => e.into(),
+            E::Cancelled | E::BrokenDevice(_) => Self::failure(e),
             _ => Self { code: code_of(&e), source: e.into() },
         }
     }
@@ -133,10 +145,13 @@ macro_rules! other_errors {
 other_errors!(
     freerange_camera::CameraError,
     freerange_eval::EvalError,
+    freerange_formats::FormatError,
+    freerange_hub::HubError,
     freerange_mesh::MeshError,
     freerange_metrics::MetricsError,
     freerange_model::ModelError,
     freerange_raster::RasterError,
+    freerange_scene::SceneError,
     freerange_splat::SplatError
 );
 

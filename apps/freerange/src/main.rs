@@ -1,11 +1,9 @@
 //! `freerange`: posed photos in, 3D Gaussians out.
 
 mod commands;
-mod device;
 mod error;
 mod output;
-mod pictures;
-mod pipeline;
+mod photos;
 mod progress;
 mod runtime;
 
@@ -31,8 +29,12 @@ struct Cli {
 enum Command {
     /// Reconstruct an object from posed images.
     Reconstruct(commands::reconstruct::Args),
-    /// Render a .ply of Gaussians from given cameras.
+    /// Show what is understood of a scene: cameras, masks, place and size, and what may go wrong.
+    Inspect(commands::inspect::Args),
+    /// Render Gaussians from given cameras.
     Render(commands::render::Args),
+    /// Convert Gaussians between file formats, or into a page that shows them.
+    Convert(commands::convert::Args),
     /// Measure a method on objects with validation views; compare reports; ablations.
     ///
     /// Images are compared over white at their own resolution. Writes report.html, report.md and report.json into the output
@@ -74,7 +76,9 @@ fn main() -> ExitCode {
     tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
     let result = match cli.command {
         Command::Reconstruct(args) => commands::reconstruct::run(&args),
+        Command::Inspect(args) => commands::inspect::run(&args),
         Command::Render(args) => commands::render::run(&args),
+        Command::Convert(args) => commands::convert::run(&args),
         Command::Eval(args) => commands::eval::run(&args),
         Command::Weights(command) => commands::weights::run(&command),
         Command::Train(args) => commands::train::run(&args),

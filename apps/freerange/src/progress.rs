@@ -16,7 +16,6 @@ pub struct Progress {
     label: String,
     total: u64,
     last_line: Instant,
-    silent: bool,
 }
 
 impl Progress {
@@ -29,12 +28,7 @@ impl Progress {
         let style =
             ProgressStyle::with_template("{prefix:>12} {bar:32} {pos}/{len} {eta} {msg}").expect("a valid template");
         let bar = ProgressBar::with_draw_target(Some(total), target).with_style(style).with_prefix(label.to_owned());
-        Self { bar, label: label.into(), total, last_line: Instant::now(), silent: false }
-    }
-
-    /// A task that shows nothing: it is part of one that does.
-    pub fn silent() -> Self {
-        Self { bar: ProgressBar::hidden(), label: String::new(), total: 0, last_line: Instant::now(), silent: true }
+        Self { bar, label: label.into(), total, last_line: Instant::now() }
     }
 
     /// Prints a line on standard output without disturbing the bar.
@@ -54,7 +48,7 @@ impl Progress {
         self.bar.set_position(done);
         self.bar.set_message(message.to_owned());
         // The first line waits too: quick tasks need none.
-        if self.bar.is_hidden() && !self.silent && self.last_line.elapsed() >= LINE_EVERY {
+        if self.bar.is_hidden() && self.last_line.elapsed() >= LINE_EVERY {
             eprintln!("{}: {done}/{} {message}", self.label, self.total);
             self.last_line = Instant::now();
         }

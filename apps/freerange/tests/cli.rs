@@ -50,7 +50,8 @@ fn edit(scene: &TempDir, change: impl FnOnce(&mut serde_json::Value)) {
 fn refused(scene: &Path, extra: &[&str], words: &[&str]) {
     let place = tempfile::tempdir().unwrap();
     let output = place.path().join("result");
-    let mut args = vec!["reconstruct", scene.to_str().unwrap(), "-o", output.to_str().unwrap(), "--steps", "1"];
+    let mut args =
+        vec!["reconstruct", scene.to_str().unwrap(), "-o", output.to_str().unwrap(), "--steps", "1", "--refine", "0"];
     args.extend(extra);
     let done = freerange(&args);
     let message = String::from_utf8_lossy(&done.stderr).into_owned();
@@ -118,7 +119,18 @@ fn the_same_seed_gives_the_same_bytes() {
     let run = |name: &str, seed: &str| {
         let output = place.path().join(name);
         let (scene, out) = (example(), output.to_str().unwrap().to_owned());
-        let done = freerange(&["reconstruct", scene.to_str().unwrap(), "-o", &out, "--steps", "2", "--seed", seed]);
+        let done = freerange(&[
+            "reconstruct",
+            scene.to_str().unwrap(),
+            "-o",
+            &out,
+            "--steps",
+            "2",
+            "--refine",
+            "3",
+            "--seed",
+            seed,
+        ]);
         assert!(done.status.success());
         fs::read(output.join("gaussians.ply")).unwrap()
     };
@@ -249,7 +261,15 @@ fn a_full_disk() {
     let output = place.path().join("result");
     let done = Command::new("sh")
         .args(["-c", "trap '' XFSZ; ulimit -f 8; exec \"$0\" \"$@\"", env!("CARGO_BIN_EXE_freerange"), "reconstruct"])
-        .args([example().as_os_str(), "-o".as_ref(), output.as_os_str(), "--steps".as_ref(), "1".as_ref()])
+        .args([
+            example().as_os_str(),
+            "-o".as_ref(),
+            output.as_os_str(),
+            "--steps".as_ref(),
+            "1".as_ref(),
+            "--refine".as_ref(),
+            "0".as_ref(),
+        ])
         .output()
         .unwrap();
     let message = String::from_utf8_lossy(&done.stderr).into_owned();

@@ -6,13 +6,17 @@ mod camera;
 mod error;
 mod frame;
 pub mod image_ops;
+mod lens;
 mod plucker;
 pub mod scene;
 mod selection;
+mod square;
 
 pub use camera::{Camera, View};
 pub use error::{CameraError, Place};
 pub use frame::{CANONICAL_RADIUS, CanonicalFrame, FrameConfig, Similarity, Up, canonical_from_user, outline_radius};
+pub use lens::Lens;
 pub use plucker::{PatchLayout, plucker};
 pub use scene::{Scene, load_cameras, transforms_json};
 pub use selection::{SelectionConfig, ViewSets, inputs_around, inputs_beside, k_means, select_views};
+pub use square::Window;

@@ -292,9 +292,9 @@ fn descriptions_that_make_no_sense_are_refused() {
         (|d| d["frames"][2]["transform_matrix"][1].as_array_mut().unwrap().truncate(2), &["frame 2", "rows of 4"]),
         (|d| d["frames"][2]["transform_matrix"][3][3] = json!(2), &["frame 2", "last row"]),
         (|d| d["frames"][2]["transform_matrix"][0][3] = json!(1e300), &["frame 2", "farther"]),
-        (|d| d["camera_model"] = json!("OPENCV_FISHEYE"), &["frame 0", "OPENCV_FISHEYE", "not supported"]),
+        (|d| d["camera_model"] = json!("THIN_PRISM_FISHEYE"), &["frame 0", "THIN_PRISM_FISHEYE", "not supported"]),
         (|d| d["camera_model"] = json!(3), &["`camera_model` 3"]),
-        (|d| d["is_fisheye"] = json!(true), &["is_fisheye"]),
+        (|d| d["is_fisheye"] = json!(1), &["`is_fisheye`", "true or false"]),
         (|d| d["k5"] = json!(0.1), &["`k5`", "not supported"]),
         (|d| d["distortion_params"] = json!([0.1, 0, 0, 0]), &["distortion_params"]),
         (|d| (d["camera_model"], d["k1"]) = (json!("PINHOLE"), json!(0.1)), &["`camera_model`", "OPENCV"]),
@@ -385,7 +385,7 @@ fn distortion_is_removed() {
     const W: u32 = 96;
     const H: u32 = 80;
     let camera = Camera { cx: 50.0, cy: 38.0, fy: 90.0, ..Camera::look_at(DVec3::X, DVec3::ZERO, DVec3::Z, 1.0, W, H) };
-    let lens = freerange_camera::scene::Distortion { k: [0.12, -0.05, 0.01, 0.004], p: [0.01, -0.02] };
+    let lens = freerange_camera::Lens::brown([0.12, -0.05, 0.01, 0.004], [0.01, -0.02]);
     let pattern = |x: f64, y: f64, c: usize| 128.0 + 90.0 * (6.0 * x + 0.5 * c as f64).sin() * (5.0 * y + 1.0).cos();
     let ideal =
         |j: u32, i: u32| ((f64::from(j) + 0.5 - camera.cx) / camera.fx, (f64::from(i) + 0.5 - camera.cy) / camera.fy);
@@ -414,7 +414,7 @@ fn distortion_is_removed() {
     assert!(seen > W * H * 8 / 10);
 
     // Without distortion nothing changes; a scene with it says what was done.
-    assert_eq!(freerange_camera::scene::Distortion::default().undistort(&taken, &camera), taken);
+    assert_eq!(freerange_camera::Lens::default().undistort(&taken, &camera), taken);
     let files = Files::new();
     let mut d = description();
     (d["camera_model"], d["k1"], d["p1"]) = (json!("OPENCV"), json!(0.1), json!(0.01));

@@ -37,7 +37,7 @@ pub use inspect::{Report, contact_sheet, inspect};
 pub use items::{Input, Item, Items};
 pub use manifest::{FORMAT, Failure, Manifest, ObjectRecord, Plan, ShardRecord};
 pub use object::{GaussianSource, HeldOutPsnr, Object, ObjectConfig, Seconds};
-pub use quality::{CountQuality, Quality, measure_quality};
+pub use quality::{CountQuality, Quality, measure_quality, psnr_over_white};
 pub use sample::Metadata;
 pub use shard::ShardReader;
 pub use shards::Shards;

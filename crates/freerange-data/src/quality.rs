@@ -106,7 +106,10 @@ pub fn measure_quality(item: &Item, config: &BuildConfig, counts: &[usize]) -> R
 }
 
 /// PSNR in dB of renders of `cloud` against `views`, in front of white: mean over the views.
-pub(crate) fn psnr_over_white(cloud: &Cloud, views: &[View]) -> Result<f64, DataError> {
+///
+/// # Errors
+/// What the rasteriser refuses.
+pub fn psnr_over_white(cloud: &Cloud, views: &[View]) -> Result<f64, DataError> {
     let mut sum = 0.0;
     for view in views {
         sum += psnr(&render_over_white(cloud, &view.camera)?, &over_white(&view.image))?.min(BEST_PSNR);

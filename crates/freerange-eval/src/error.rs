@@ -43,6 +43,9 @@ pub enum EvalError {
         /// What it is like.
         found: String,
     },
+    /// A report is asked for before all cases have been worked on.
+    #[error("{0}: no result yet; run the other shares first, then without --share")]
+    NoRecord(String),
     /// Two reports cannot be compared.
     #[error("the reports cannot be compared: {0}")]
     Incomparable(String),
@@ -52,6 +55,9 @@ pub enum EvalError {
     /// Cameras or their choice.
     #[error(transparent)]
     Camera(#[from] freerange_camera::CameraError),
+    /// The rasteriser.
+    #[error(transparent)]
+    Raster(#[from] freerange_raster::RasterError),
     /// A metric.
     #[error(transparent)]
     Metrics(#[from] freerange_metrics::MetricsError),

@@ -1,7 +1,8 @@
 //! The evaluation: which views a method is shown and which score it, the scores, what they add up to, and reports.
 //!
 //! Start with [`EvalObject`] (the protocol), [`Scorer`] (the metrics) and [`Report`]. [`RunFolder`] keeps results so that
-//! a run can be stopped and gone on with. What is evaluated, and how it makes its Gaussians, is for the caller to know.
+//! a run can be stopped and gone on with, and [`runner`] works through one. What is evaluated, and how it makes its Gaussians,
+//! is for the caller to know.
 
 pub mod ablation;
 pub mod compare;
@@ -9,10 +10,12 @@ pub mod document;
 mod error;
 mod folder;
 pub mod html;
+pub mod memory;
 mod object;
 pub mod paper;
 pub mod record;
 mod report;
+pub mod runner;
 mod scorer;
 pub mod statistics;
 mod strip;

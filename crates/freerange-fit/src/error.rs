@@ -10,7 +10,7 @@ pub enum FitError {
     /// There is nothing to refine.
     #[error("the cloud to start from holds no Gaussians")]
     EmptyCloud,
-    /// A view cannot be used, or not together with the first one.
+    /// A view cannot be used.
     #[error("view {name:?}: {field}: expected {expected}, found {found}")]
     View {
         /// The view's name.

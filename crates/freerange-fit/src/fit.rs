@@ -21,7 +21,7 @@ use std::ops::ControlFlow;
 /// every step, and ends the fit with what it has by `ControlFlow::Break`. The same input gives the same bytes.
 ///
 /// # Errors
-/// If there are no views, or they differ in size from their camera or each other; if the configuration is impossible,
+/// If there are no views, or they differ in size from their camera; if the configuration is impossible,
 /// `initial` is empty, not finite or larger than `max_gaussians`; or if the optimisation diverges.
 pub fn fit(
     views: &[View],

@@ -48,11 +48,17 @@ pub fn frame_of(cloud: &Cloud, views: &[View]) -> Result<Similarity, FitError> {
 /// The sum of each Gaussian's blending weights over the pixels of all views: the derivative of the sum of one colour's
 /// pixels by that colour of the Gaussian. `[n]`
 fn seen(cloud: &Cloud, targets: &Targets) -> Result<Vec<f64>, FitError> {
-    let black = vec![[0.0; 3]; targets.cameras.len()];
-    let output = render(cloud.rows(), &targets.cameras, &black, &targets.raster)?;
-    let red: Vec<f32> = [1.0, 0.0, 0.0].into_iter().cycle().take(output.rgb.len()).collect();
-    let gradients = render_backward(cloud.rows(), &output, &red, &[], &[])?.gaussians;
-    Ok(gradients.as_chunks::<CHANNELS>().0.iter().map(|g| f64::from(g[channel::COLOR.start]).max(0.0)).collect())
+    let all: Vec<usize> = (0..targets.cameras.len()).collect();
+    let mut seen = vec![0.0; cloud.len()];
+    for (group, raster) in targets.groups(&all) {
+        let cameras: Vec<_> = group.iter().map(|&i| targets.cameras[i]).collect();
+        let output = render(cloud.rows(), &cameras, &vec![[0.0; 3]; group.len()], raster)?;
+        let red: Vec<f32> = [1.0, 0.0, 0.0].into_iter().cycle().take(output.rgb.len()).collect();
+        let gradients = render_backward(cloud.rows(), &output, &red, &[], &[])?.gaussians;
+        let weights = gradients.as_chunks::<CHANNELS>().0.iter().map(|g| f64::from(g[channel::COLOR.start]).max(0.0));
+        seen.iter_mut().zip(weights).for_each(|(sum, weight)| *sum += weight);
+    }
+    Ok(seen)
 }
 
 /// The centre of the box along the axes around the Gaussians up to one standard deviation, weighted. None where nothing

@@ -21,23 +21,29 @@ impl Objective {
         background: [f32; 3],
         lambda_ssim: f64,
     ) -> Result<Self, FitError> {
-        let cameras: Vec<_> = chosen.iter().map(|&i| targets.cameras[i]).collect();
-        let output = render(cloud.rows(), &cameras, &vec![background; chosen.len()], &targets.raster)?;
-        let size = targets.width * targets.height * 3;
-        let mut d_rgb = vec![0.0; output.rgb.len()]; // [views, h, w, 3]
         let share = 1.0 / chosen.len() as f32;
-        let losses: Vec<f64> = output
-            .rgb
-            .par_chunks(size)
-            .zip(d_rgb.par_chunks_mut(size))
-            .zip(chosen)
-            .map(|((image, gradient), &i)| {
+        let mut losses: Vec<f64> = Vec::with_capacity(chosen.len());
+        let mut sum: Option<Vec<f32>> = None;
+        for (group, raster) in targets.groups(chosen) {
+            let cameras: Vec<_> = group.iter().map(|&i| targets.cameras[i]).collect();
+            let output = render(cloud.rows(), &cameras, &vec![background; group.len()], raster)?;
+            let (width, height) = targets.size(group[0]);
+            let size = width * height * 3;
+            let mut d_rgb = vec![0.0; output.rgb.len()]; // [views, h, w, 3]
+            let compared = output.rgb.par_chunks(size).zip(d_rgb.par_chunks_mut(size)).zip(group);
+            let compared = compared.map(|((image, gradient), &i)| {
                 let target = targets.composite(i, background);
-                compare(image, &target, targets.width, lambda_ssim as f32, share, gradient)
-            })
-            .collect::<Result<_, _>>()?;
+                compare(image, &target, width, lambda_ssim as f32, share, gradient)
+            });
+            losses.extend(compared.collect::<Result<Vec<_>, _>>()?);
+            let gradients = render_backward(cloud.rows(), &output, &d_rgb, &[], &[])?.gaussians;
+            match &mut sum {
+                None => sum = Some(gradients),
+                Some(sum) => sum.iter_mut().zip(gradients).for_each(|(sum, g)| *sum += g),
+            }
+        }
         let loss = losses.iter().sum::<f64>() / chosen.len() as f64;
-        let gradients = render_backward(cloud.rows(), &output, &d_rgb, &[], &[])?.gaussians;
+        let gradients = sum.unwrap_or_else(|| vec![0.0; cloud.rows().len()]);
         Ok(Self { loss, gradients })
     }
 
@@ -216,7 +222,11 @@ mod tests {
     /// All terms together, against central differences.
     #[test]
     fn gradients_match_finite_differences() {
-        let targets = Targets::new(&ring(3, 24, &ball(12, 1)), None).unwrap();
+        // Of two sizes, one of them with another blur.
+        let mut views = ring(3, 24, &ball(12, 1));
+        views[2] = ring(3, 40, &ball(12, 1)).remove(2);
+        let targets = Targets::new(&views, Some(32)).unwrap();
+        assert_eq!(targets.groups(&[0, 1, 2]).map(|(group, _)| group.len()).collect::<Vec<_>>(), [2, 1]);
         let mut cloud = ball(12, 3);
         let hold = HoldConfig { weight: 0.5, views: 5, size: 24, ..Default::default() };
         let hold = Hold::new(&ball(12, 2), &hold).unwrap();

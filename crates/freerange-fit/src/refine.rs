@@ -20,7 +20,7 @@ use std::ops::ControlFlow;
 /// `ControlFlow::Break`. The same input gives the same bytes.
 ///
 /// # Errors
-/// If there are no views, or they differ in size from their camera or each other; if the configuration is impossible;
+/// If there are no views, or they differ in size from their camera; if the configuration is impossible;
 /// if the cloud is empty or not finite; or if the optimisation diverges.
 pub fn refine(
     cloud: &Cloud,

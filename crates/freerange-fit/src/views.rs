@@ -9,14 +9,11 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
-/// Views of one size.
+/// Views, each of its own size.
 pub(crate) struct Targets {
     pub cameras: Vec<Camera>,
     pub images: Vec<RgbaImage>,
-    pub width: usize,
-    pub height: usize,
-    /// For renders that are compared with the (shrunk) images.
-    pub raster: RasterConfig,
+    rasters: Vec<RasterConfig>,
 }
 
 fn refuse<T>(view: &View, field: &'static str, expected: String, found: String) -> Result<T, FitError> {
@@ -48,37 +45,50 @@ fn check(view: &View) -> Result<(), FitError> {
     Ok(())
 }
 
+/// Width and height with a longest side of at most `size`.
+fn shrunk((width, height): (u32, u32), size: Option<u32>) -> (u32, u32) {
+    let longest = width.max(height);
+    match size {
+        Some(size) if size < longest => {
+            let shrink = |side: u32| {
+                let exact = f64::from(side) * f64::from(size) / f64::from(longest);
+                (exact.round() as u32).max(1)
+            };
+            (shrink(width), shrink(height))
+        }
+        _ => (width, height),
+    }
+}
+
 impl Targets {
     /// Checks the views and shrinks those whose longest side exceeds `size`.
     pub fn new(views: &[View], size: Option<u32>) -> Result<Self, FitError> {
-        let first = views.first().ok_or(FitError::NoViews)?;
-        for view in views {
-            check(view)?;
-            let (found, expected) = (view.image.dimensions(), first.image.dimensions());
-            if found != expected {
-                let expected = format!("{} x {} pixels as in {:?}", expected.0, expected.1, first.name);
-                return refuse(view, "image", expected, format!("{} x {}", found.0, found.1));
-            }
+        if views.is_empty() {
+            return Err(FitError::NoViews);
         }
-        let (width, height) = first.image.dimensions();
-        let longest = width.max(height);
-        let (width, height) = match size {
-            Some(size) if size < longest => {
-                let shrink = |side: u32| {
-                    let exact = f64::from(side) * f64::from(size) / f64::from(longest);
-                    (exact.round() as u32).max(1)
-                };
-                (shrink(width), shrink(height))
-            }
-            _ => (width, height),
-        };
+        views.iter().try_for_each(check)?;
+        let sizes: Vec<(u32, u32)> = views.iter().map(|v| shrunk(v.image.dimensions(), size)).collect();
+        let sized = || views.par_iter().zip(&sizes);
+        let longest = |(w, h): (u32, u32)| w.max(h) as f32;
+        let raster =
+            |(v, &small): (&View, _)| RasterConfig::default().shrunk(longest(small) / longest(v.image.dimensions()));
         Ok(Self {
-            cameras: views.iter().map(|v| v.camera.resized(width, height)).collect(),
-            images: views.par_iter().map(|v| image_ops::resize_area(&v.image, width, height)).collect(),
-            width: width as usize,
-            height: height as usize,
-            raster: RasterConfig::default().shrunk(width as f32 / first.image.width() as f32),
+            cameras: sized().map(|(v, &(w, h))| v.camera.resized(w, h)).collect(),
+            images: sized().map(|(v, &(w, h))| image_ops::resize_area(&v.image, w, h)).collect(),
+            rasters: sized().map(raster).collect(),
         })
+    }
+
+    /// The views `chosen`, in groups that can be rendered together (one size, one blur), and how to render these.
+    pub fn groups<'a>(&'a self, chosen: &'a [usize]) -> impl Iterator<Item = (&'a [usize], &'a RasterConfig)> {
+        let kind = |i: usize| (self.images[i].dimensions(), self.rasters[i].blur.to_bits());
+        chosen.chunk_by(move |&a, &b| kind(a) == kind(b)).map(|group| (group, &self.rasters[group[0]]))
+    }
+
+    /// Width and height of view `i` in pixels.
+    pub fn size(&self, i: usize) -> (usize, usize) {
+        let (w, h) = self.images[i].dimensions();
+        (w as usize, h as usize)
     }
 
     /// View `i` over `background`, `[h, w, 3]`.
@@ -92,7 +102,8 @@ impl Targets {
         let p = c.world_to_camera.transform_point3(point);
         let (x, y) = (c.fx * p.x / p.z + c.cx, c.fy * p.y / p.z + c.cy);
         // Phrased so that NaN fails it.
-        let inside = p.z > 0.0 && x >= 0.0 && y >= 0.0 && x < self.width as f64 && y < self.height as f64;
+        let (width, height) = self.size(i);
+        let inside = p.z > 0.0 && x >= 0.0 && y >= 0.0 && x < width as f64 && y < height as f64;
         inside.then(|| self.images[i].get_pixel(x as u32, y as u32).0)
     }
 }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use freerange_camera::{
-    PatchLayout, Similarity, View,
+    PatchLayout, Similarity, View, Window,
     image_ops::{resize_area, to_f32_rgba},
     plucker,
 };
@@ -19,7 +19,7 @@ use rand_distr::{Distribution, StandardNormal};
 use crate::{
     FlowError,
     config::{FrameJitter, LossConfig, Stage},
-    path::guess_weight,
+    path::{guess_weight, render_weight},
     photometric::{Images, Targets},
 };
 
@@ -32,6 +32,15 @@ pub fn shrink(view: &View, size: u32) -> View {
     }
     let scaled = |x: u32| ((f64::from(x) * f64::from(size) / f64::from(longest)).round() as u32).max(1);
     resized(view, scaled(w), scaled(h))
+}
+
+/// The views of all objects as squares of one size, at most `size` pixels and at most those of the smallest, to compare
+/// renders with. Pixels stay square.
+pub fn squares(objects: &[&[View]], size: u32) -> Vec<Vec<View>> {
+    let windows = |o: &&[View]| o.iter().map(|v| Window::compared(v).cut(v).into_owned()).collect::<Vec<_>>();
+    let cut: Vec<Vec<View>> = objects.iter().map(windows).collect();
+    let side = cut.iter().flatten().map(|v| v.image.width()).min().map_or(size, |smallest| smallest.min(size));
+    cut.iter().map(|o| o.iter().map(|v| resized(v, side, side)).collect()).collect()
 }
 
 fn resized(view: &View, w: u32, h: u32) -> View {
@@ -56,8 +65,8 @@ pub struct Conditioning {
 }
 
 impl Conditioning {
-    /// From the input views of each object; all objects have the same number of views. Images are resized to the
-    /// encoder's square side, intrinsics with them.
+    /// From the input views of each object; all objects have the same number of views. Images are cut or padded to
+    /// [squares](Window::around) and resized to the encoder's side, intrinsics with them.
     pub fn new(objects: &[Vec<&View>], config: &ModelConfig, device: &Device) -> Result<Self, FlowError> {
         let (b, v) = (objects.len(), objects.first().map_or(0, Vec::len));
         if v == 0 {
@@ -67,7 +76,7 @@ impl Conditioning {
         let (channels, grid) = (config.image_channels(), config.patches_per_side());
         let (mut pixels, mut rays) = (Vec::new(), Vec::new());
         for view in objects.iter().flatten() {
-            let view = resized(view, size, size);
+            let view = resized(&Window::around(view).cut(view), size, size);
             pixels.extend(to_f32_rgba(&view.image).chunks_exact(4).flat_map(|p| {
                 let on_white = |c: f32| c * p[3] + 1.0 - p[3];
                 [on_white(p[0]), on_white(p[1]), on_white(p[2]), p[3]].into_iter().take(channels)
@@ -98,8 +107,10 @@ pub struct Batch {
     pub clean: Tensor<3>,
     /// The quick fits that the paths started from, paired with the data; none if they started from noise. `[b, n, 14]`
     pub fits: Option<Tensor<3>>,
-    /// Whether the network is fed its own estimate.
-    pub self_conditioned: bool,
+    /// How many estimates the network makes, each fed to the next, before the one that is trained.
+    pub estimates: usize,
+    /// Weight of each sample's rendering losses.
+    pub render_weights: Vec<f32>,
     /// Time of each sample.
     pub t: Vec<f32>,
     /// 1 where the sample sees its images, 0 where it is trained unconditionally. `[b, 1, 1]`
@@ -127,7 +138,11 @@ impl Batch {
     ) -> Result<Self, FlowError> {
         let (b, n) = (objects.len(), 1usize << stage.depth);
         let start = loss.start.filter(|start| rng.random::<f32>() < start.share);
-        let self_conditioned = rng.random::<f32>() < loss.self_conditioning;
+        let estimates = match rng.random::<f32>() < loss.self_conditioning {
+            true if loss.estimates > 1 => rng.random_range(1..=loss.estimates),
+            fed => usize::from(fed),
+        };
+        let held_at_start = start.filter(|start| start.hold > 0.0 && rng.random::<f32>() < start.hold);
         let fits = start.map(|_| same_fit(objects, stage.depth, loss.held_views, rng)).transpose()?;
         let inputs = rng.random_range(loss.input_views.0..=loss.input_views.1);
         let one_sided = rng.random::<f32>() < loss.one_sided;
@@ -146,7 +161,10 @@ impl Batch {
             };
             let mut epsilon: Vec<f32> = (0..n * channel::COUNT).map(|_| StandardNormal.sample(rng)).collect();
             let first = start.map_or(0.0, |s| s.time);
-            let time = first + (1.0 - first) * loss.time.draw(rng);
+            let time = match held_at_start {
+                Some(_) => first,
+                None => first + (1.0 - first) * loss.time.draw(rng),
+            };
             // A fit is made of the images: there is no way without them from it.
             let blind = rng.random::<f32>() < loss.unconditional && start.is_none();
             t.push(time);
@@ -175,6 +193,7 @@ impl Batch {
                     }
                     let guess = normalization.normalize(&guess);
                     loss.coupling.pair(&mut epsilon, &guess); // as when sampling
+                    epsilon.iter_mut().for_each(|e| *e *= start.map_or(1.0, |s| s.noise));
                     let w = guess_weight(time, first);
                     on_path.extend(clean.iter().zip(&guess).map(|(x, g)| x + w * (g - x)));
                     guesses.extend(guess);
@@ -189,15 +208,20 @@ impl Batch {
             let small: Vec<Vec<&View>> = small.iter().map(|o| o.iter().collect()).collect();
             Ok::<_, FlowError>(Images::new(&small, device)?.on(&backgrounds))
         };
+        let render_size = stage.render_size.unwrap_or(loss.render_size);
         let shape = [b, n, channel::COUNT];
         let tensor = |values: Vec<f32>| Tensor::<3>::from_data(TensorData::new(values, shape), device);
         let data = tensor(data);
         Ok(Self {
             clean: if fits.is_some() { tensor(on_path) } else { data.clone() },
             fits: fits.is_some().then(|| tensor(guesses)),
-            self_conditioned,
+            estimates,
             data,
             noise: tensor(noise),
+            render_weights: match held_at_start.and_then(|start| start.render) {
+                Some(weight) => vec![weight; b],
+                None => t.iter().map(|&t| render_weight(t)).collect(),
+            },
             t,
             conditional: Tensor::from_data(TensorData::new(conditional, [b, 1, 1]), device),
             conditioning: Conditioning::new(
@@ -205,9 +229,9 @@ impl Batch {
                 model,
                 device,
             )?,
-            hint: at(&seen, loss.gradient_size)?,
-            seen: at(&seen, loss.render_size)?,
-            held: if loss.held_views > 0 { Some(at(&held, loss.render_size)?) } else { None },
+            hint: at(&seen, stage.gradient_size.unwrap_or(loss.gradient_size))?,
+            seen: at(&seen, render_size)?,
+            held: if loss.held_views > 0 { Some(at(&held, render_size)?) } else { None },
         })
     }
 }
@@ -266,7 +290,7 @@ fn draw_frame(jitter: FrameJitter, rng: &mut ChaCha8Rng) -> Similarity {
 
 /// Splits views into `count` inputs and the rest, both in random order. One-sided: the inputs are those nearest in
 /// direction to a randomly chosen one.
-fn choose_views<'a>(
+pub(crate) fn choose_views<'a>(
     views: &'a [View],
     count: usize,
     one_sided: bool,
@@ -290,5 +314,17 @@ fn choose_views<'a>(
 pub fn step_rng(seed: u64, step: u64) -> ChaCha8Rng {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     rng.set_stream(step.wrapping_add(1));
+    rng
+}
+
+/// Numbers of a step's generator, in words of 32 bits, that each part of its batch has to itself.
+const WORDS_PER_PART: u128 = 1 << 40;
+
+/// The generator of part `part` of a step's batch; part 0 goes on with `rng`, the step's own.
+pub(crate) fn part_rng(rng: ChaCha8Rng, part: usize) -> ChaCha8Rng {
+    let mut rng = rng;
+    if part > 0 {
+        rng.set_word_pos(WORDS_PER_PART * part as u128);
+    }
     rng
 }

@@ -6,7 +6,7 @@ use freerange_data::{BuildConfig, LoadLimits, ObjectConfig, ShardConfig};
 use freerange_model::{Compute, ModelConfig};
 
 use crate::{
-    FlowError,
+    FlowError, ValidationConfig,
     coupling::Coupling,
     path::TimeSchedule,
     sample::{GradientAt, SampleConfig},
@@ -32,6 +32,9 @@ pub struct TrainConfig {
     /// The curriculum, coarse to fine.
     #[serde(rename = "stage")]
     pub stages: Vec<Stage>,
+    /// Measuring on other objects while training.
+    #[serde(default)]
+    pub validation: ValidationConfig,
     /// How the finished model samples, unless the user says otherwise; kept in the checkpoint.
     #[serde(default)]
     pub sample: SampleConfig,
@@ -131,6 +134,8 @@ pub struct LossConfig {
     /// Share of the batches in which the network is fed its own estimate, made without a gradient just before
     /// (`model.estimate_channels`).
     pub self_conditioning: f32,
+    /// Most estimates that are made in such a batch, each from the one before; the number is drawn for each batch.
+    pub estimates: usize,
     /// Where the gradient that the network sees is taken; at the noisy sample where there is no estimate.
     pub gradient_at: GradientAt,
     /// Share of the batches whose input views all lie on one side of the object.
@@ -149,6 +154,20 @@ pub struct StartLoss {
     /// The time to which fits are mixed with noise: see [`guess_weight`](crate::path::guess_weight). 0: they start from pure
     /// noise, and the fit is but an estimate fed to the network.
     pub time: f32,
+    /// Factor on the noise. 0: what comes out is a function of the fit and the images.
+    #[serde(default = "one")]
+    pub noise: f32,
+    /// Of those batches, the share at the start itself: all that the network can say there comes from the images and the fit,
+    /// whereas a sample on the way to the data shows where it goes. What [`Solver::Hold`](crate::sample::Solver::Hold) wants.
+    #[serde(default)]
+    pub hold: f32,
+    /// Weight of the rendering losses at the start; left out: that of its time, `w(t)`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub render: Option<f32>,
+}
+
+fn one() -> f32 {
+    1.0
 }
 
 /// Standard deviations of the normal distributions that a training object's frame is moved by; 0: not at all.
@@ -179,6 +198,7 @@ impl Default for LossConfig {
             input_views: (4, 4),
             start: None,
             self_conditioning: 0.0,
+            estimates: 1,
             gradient_at: GradientAt::Noisy,
             one_sided: 0.0,
             frame_jitter: FrameJitter::default(),
@@ -285,8 +305,29 @@ pub struct Stage {
     pub image_size: u32,
     /// Objects per step.
     pub batch: usize,
+    /// Objects that are computed at a time; gradients are averaged over a step's. Left out: all at once.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub micro_batch: Option<usize>,
+    /// Side, in pixels, of the images that the rendering losses compare; left out: `loss.render_size`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub render_size: Option<u32>,
+    /// Side, in pixels, of the images that the network's gradient channels are taken on; left out: `loss.gradient_size`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub gradient_size: Option<u32>,
     /// Steps.
     pub steps: u64,
+}
+
+impl Stage {
+    /// Objects that are computed at a time, at most.
+    pub fn at_a_time(&self) -> usize {
+        self.micro_batch.unwrap_or(self.batch)
+    }
+
+    /// How many times a step computes.
+    pub fn parts(&self) -> usize {
+        self.batch.div_ceil(self.at_a_time())
+    }
 }
 
 impl TrainConfig {
@@ -365,9 +406,27 @@ impl TrainConfig {
         for s in &self.stages {
             check((1..=20).contains(&s.depth), "stage.depth", "1 to 20", s.depth.to_string())?;
             check(s.batch > 0, "stage.batch", "at least 1", s.batch.to_string())?;
+            check(
+                (1..=s.batch).contains(&s.at_a_time()),
+                "stage.micro_batch",
+                &format!("1 to {} (stage.batch)", s.batch),
+                s.at_a_time().to_string(),
+            )?;
+            for (field, size) in [("stage.render_size", s.render_size), ("stage.gradient_size", s.gradient_size)] {
+                check(size.is_none_or(|s| (8..=4096).contains(&s)), field, "8 to 4096", format!("{size:?}"))?;
+            }
             check(s.steps > 0, "stage.steps", "at least 1", s.steps.to_string())?;
             check((8..=2048).contains(&s.image_size), "stage.image_size", "8 to 2048", s.image_size.to_string())?;
+            let patch = self.model.encoder.patch_size();
+            check(
+                s.image_size.is_multiple_of(patch),
+                "stage.image_size",
+                &format!("a multiple of the encoder's patch, {patch}"),
+                s.image_size.to_string(),
+            )?;
         }
+        let v = &self.validation;
+        check((1..=10_000).contains(&v.objects), "validation.objects", "1 to 10000", v.objects.to_string())?;
         let l = &self.loss;
         let (low, high) = l.input_views;
         let views = self.data.object.views;
@@ -399,8 +458,17 @@ impl TrainConfig {
             "0 without model.estimate_channels",
             l.self_conditioning.to_string(),
         )?;
+        check((1..=16).contains(&l.estimates), "loss.estimates", "1 to 16", l.estimates.to_string())?;
         if let Some(start) = l.start {
             check((0.0..=1.0).contains(&start.share), "loss.start.share", "0 to 1", start.share.to_string())?;
+            check((0.0..=2.0).contains(&start.noise), "loss.start.noise", "0 to 2", start.noise.to_string())?;
+            check((0.0..=1.0).contains(&start.hold), "loss.start.hold", "0 to 1", start.hold.to_string())?;
+            check(
+                start.render.is_none_or(|w| w.is_finite() && w >= 0.0),
+                "loss.start.render",
+                "a finite number, 0 or more",
+                format!("{:?}", start.render),
+            )?;
             check((0.0..1.0).contains(&start.time), "loss.start.time", "0 to below 1", start.time.to_string())?;
             check(
                 !l.random_patches,

@@ -68,6 +68,9 @@ pub enum FlowError {
         /// The reason.
         source: std::io::Error,
     },
+    /// The caller asked to stop.
+    #[error("cancelled")]
+    Cancelled,
     /// The rasteriser refused its input.
     #[error(transparent)]
     Raster(#[from] freerange_raster::RasterError),

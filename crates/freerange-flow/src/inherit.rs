@@ -18,7 +18,7 @@ pub(crate) const PRESETS: [(&str, &str); 3] = [
 
 /// Reads a configuration and those that it descends from, and merges them: tables key by key, everything else (lists
 /// among it) as the descendant has it. A parent is the name of a preset, or a path relative to the file that names it; so
-/// are the shards.
+/// are the shards and the weights of the encoder.
 pub(crate) fn load(path: &Path) -> Result<Table, FlowError> {
     let mut chain: Vec<(PathBuf, Table)> = Vec::new();
     let mut next = Some(path.to_path_buf());
@@ -58,15 +58,26 @@ pub(crate) fn load(path: &Path) -> Result<Table, FlowError> {
     Ok(oldest_first.reduce(merged).unwrap_or_default())
 }
 
-/// Makes the path of the shards, which is relative to the file that names it, one that can be opened from here.
+/// Makes paths, which are relative to the file that names them, ones that can be opened from here.
 fn locate(table: &mut Table, folder: &Path) {
-    let shards = table.get_mut("data").and_then(|data| data.get_mut("shards"));
-    if let Some(Value::String(place)) = shards
-        && !place.contains("://")
-        && let Some(found) = folder.join(&*place).to_str()
-    {
-        *place = found.to_owned();
-    }
+    let mut path = |keys: &[&str]| {
+        let (last, tables) = keys.split_last()?;
+        let table = tables.iter().try_fold(&mut *table, |t, key| t.get_mut(*key)?.as_table_mut())?;
+        if let Some(Value::String(place)) = table.get_mut(*last)
+            && is_path(place)
+            && let Some(found) = folder.join(&*place).to_str()
+        {
+            *place = found.to_owned();
+        }
+        Some(())
+    };
+    path(&["data", "shards"]);
+    path(&["model", "encoder", "weights"]);
+}
+
+/// Whether a place is in the file system, not a URL or a repository of the Hugging Face hub.
+pub(crate) fn is_path(place: &str) -> bool {
+    !place.contains("://") && !place.starts_with("hf:")
 }
 
 /// `over` laid over `under`.

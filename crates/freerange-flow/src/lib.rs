@@ -14,6 +14,8 @@ pub mod photometric;
 pub mod sample;
 pub mod train;
 pub mod trainer;
+mod validation;
 mod weights;
 
 pub use error::FlowError;
+pub use validation::{Figures, ValidationConfig};

@@ -48,6 +48,22 @@ impl Flat {
         Self(collect.1)
     }
 
+    /// All values, one parameter after the other.
+    #[cfg(test)]
+    pub fn values(&self) -> Vec<f32> {
+        let values = |g: &Tensor<1>| g.clone().into_data().try_to_vec::<f32>().expect("f32");
+        self.0.iter().flatten().flat_map(values).collect()
+    }
+
+    /// The sum with those of another part of the batch.
+    pub fn add(self, other: Self) -> Self {
+        let both = self.0.into_iter().zip(other.0).map(|pair| match pair {
+            (Some(a), Some(b)) => Some(a + b),
+            (a, b) => a.or(b),
+        });
+        Self(both.collect())
+    }
+
     /// The joint Euclidean norm. `[1]`, on the device.
     pub fn norm(&mut self, device: &Device) -> Tensor<1> {
         let gradients = self.0.iter_mut().flatten();

@@ -1,5 +1,7 @@
 //! Sampling: from noise to Gaussians that fit the posed images (paper, Section 3.5).
 
+use std::{cell::RefCell, ops::ControlFlow};
+
 use burn::tensor::{Device, Tensor, TensorData};
 use freerange_camera::View;
 use freerange_fit::{QuickFitConfig, tree_slice};
@@ -11,7 +13,7 @@ use rand_distr::{Distribution, StandardNormal};
 
 use crate::{
     FlowError,
-    batch::{Conditioning, draw_background, shrink},
+    batch::{Conditioning, draw_background, squares},
     coupling::Coupling,
     photometric::{Images, Photometric},
 };
@@ -33,7 +35,8 @@ pub struct SampleConfig {
     pub start: Option<StartConfig>,
     /// Classifier-free guidance scale s: `z_u + s (z_c - z_u)`. 1 switches it off (and halves the work).
     pub guidance: f32,
-    /// Photometric guidance scale lambda_PG. 0 switches it off. What it multiplies is told by `photometric_step`.
+    /// Photometric guidance scale lambda_PG. 0 switches it off. What it multiplies is told by `photometric_step`. It acts
+    /// on what the next step starts from, and on the result where there is one step only.
     pub photometric: f32,
     /// The gradient that photometric guidance follows.
     pub photometric_step: PhotometricStep,
@@ -52,6 +55,23 @@ pub struct SampleConfig {
     pub coupling: Coupling,
     /// Arithmetic of the transformer's blocks.
     pub compute: Compute,
+    /// Steps of 3DGS-MCMC on the input views that follow ([`freerange_fit::refine`]); [`reconstruct`] itself takes none.
+    pub refine: usize,
+    /// What is different where a model that starts from fits by itself is asked to start from pure noise; left out: nothing.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub from_noise: Option<FromNoise>,
+}
+
+/// How a model samples from pure noise that by itself starts from fits.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FromNoise {
+    /// [`SampleConfig::steps`]
+    pub steps: usize,
+    /// [`SampleConfig::solver`]
+    pub solver: Solver,
+    /// [`SampleConfig::photometric`]
+    pub photometric: f32,
 }
 
 impl Default for SampleConfig {
@@ -71,11 +91,22 @@ impl Default for SampleConfig {
             background: Background::Random,
             coupling: Coupling::Independent,
             compute: Compute::F32,
+            refine: 0,
+            from_noise: None,
         }
     }
 }
 
 impl SampleConfig {
+    /// The same from pure noise: see [`from_noise`](Self::from_noise).
+    pub fn without_start(mut self) -> Self {
+        if let (Some(_), Some(noise)) = (self.start.take(), self.from_noise) {
+            let FromNoise { steps, solver, photometric } = noise;
+            self = Self { steps, solver, photometric, ..self };
+        }
+        self
+    }
+
     /// Refuses impossible values.
     pub fn validate(&self) -> Result<(), FlowError> {
         let bad = |field: &str, expected: &str, found: String| {
@@ -86,6 +117,12 @@ impl SampleConfig {
         }
         if self.depth.is_some_and(|d| !(1..=20).contains(&d)) {
             return bad("depth", "1 to 20", format!("{:?}", self.depth));
+        }
+        if self.refine > 100_000 {
+            return bad("refine", "0 to 100000", self.refine.to_string());
+        }
+        if self.solver == Solver::Hold && self.start.is_none() {
+            return bad("solver", "euler, heun or multistep without sample.start", "hold".into());
         }
         if let Some(start) = &self.start {
             if !(0.0..1.0).contains(&start.time) {
@@ -207,6 +244,10 @@ pub enum Solver {
     /// time instead of in the log of the signal-to-noise ratio, whose steps do not shrink near the data. One evaluation
     /// per step.
     Multistep,
+    /// Not at all: the sample stays where it starts, and only the estimate is fed back, from step to step. Each estimate is then
+    /// the mean of what is likely rather than a draw from it. For models that were trained so from fits
+    /// ([`StartLoss::hold`](crate::config::StartLoss)).
+    Hold,
 }
 
 /// The state that [`integrate`] hands to its callbacks.
@@ -224,7 +265,8 @@ pub struct Step {
 /// `z <- z - push`.
 ///
 /// `estimate` gives the guided estimate z1_hat of the clean sample, `push` the photometric step `lambda grad` taken at the
-/// first estimate of each step (or nothing). Returns the last estimate, which is what the paper denormalises.
+/// first estimate of each step (or nothing; [`Solver::Hold`] leaves it to the callbacks, which share the estimate). Returns the
+/// last estimate less its push; the paper's, which is what it denormalises, has none.
 pub fn integrate(
     mut z: Tensor<3>,
     start: f32,
@@ -236,6 +278,14 @@ pub fn integrate(
     let time = |i: usize| start + (1.0 - start) * i as f32 / steps as f32;
     let mut last = z.clone();
     for index in 0..steps {
+        if solver == Solver::Hold {
+            let step = Step { index, t: start, z: z.clone() };
+            last = estimate(&step)?;
+            match push(&step, &last)? {
+                Some(push) if index + 1 == steps => return Ok(last - push),
+                _ => continue,
+            }
+        }
         let (t, next) = (time(index), time(index + 1));
         let share = 1.0 / (steps - index) as f32; // of the way from z to the estimate
         let step = Step { index, t, z: z.clone() };
@@ -259,11 +309,46 @@ pub fn integrate(
             _ => towards(last.clone()),
         };
         z = match push(&step, &last)? {
+            Some(push) if index + 1 == steps => return Ok(last - push),
             Some(push) => moved - push,
             None => moved,
         };
     }
     Ok(last)
+}
+
+/// What the network takes the clean Gaussians to be, after a step of sampling.
+#[derive(Clone, Copy, Debug)]
+pub struct Estimate<'a> {
+    /// Number of the step, from 0.
+    pub index: usize,
+    /// The time that the step began at.
+    pub t: f32,
+    normalized: &'a Tensor<3>, // [b, n, 14]
+    photometric: &'a Photometric,
+    seeds: usize,
+}
+
+impl Estimate<'_> {
+    /// The Gaussians, `[objects][seeds]`, in the objects' canonical frames. On a GPU this waits for what is queued.
+    ///
+    /// # Errors
+    /// If the values cannot be read back.
+    pub fn clouds(&self) -> Result<Vec<Vec<Cloud>>, FlowError> {
+        clouds(self.photometric.denormalize(self.normalized.clone()), self.seeds)
+    }
+}
+
+/// Raw channels as Gaussians. `[objects * seeds, n, 14]` to `[objects][seeds]`
+fn clouds(raw: Tensor<3>, seeds: usize) -> Result<Vec<Vec<Cloud>>, FlowError> {
+    let row = raw.dims()[1] * channel::COUNT;
+    let values = raw.into_data().try_to_vec::<f32>().map_err(|_| FlowError::NoGradient)?;
+    let cloud = |rows: &[f32]| {
+        let mut cloud = Cloud::from_rows(rows.to_vec());
+        cloud.canonicalize_rotations();
+        cloud
+    };
+    Ok(values.chunks_exact(row * seeds).map(|object| object.chunks_exact(row).map(cloud).collect()).collect())
 }
 
 /// `uncond + s (cond - uncond)`: classifier-free guidance.
@@ -275,8 +360,12 @@ pub fn classifier_free(conditional: Tensor<3>, unconditional: Tensor<3>, scale: 
 ///
 /// `objects` are the views of each object, as many for each, in its canonical frame (object within radius 0.5 of the
 /// origin); so are the results, `[objects][seeds]`. `fits` are [quick fits](freerange_fit::quick_fit) of the views of each
-/// object, which `config.start` asks for and nothing else looks at. All samples run as one batch. `progress` is told each step before it
-/// is taken; on a GPU, steps are only queued by then, and nothing waits for them but the end.
+/// object, which `config.start` asks for and nothing else looks at. All samples run as one batch. `progress` is told of
+/// every step and may end it all by `ControlFlow::Break`; on a GPU, the step is only queued by then, and nothing waits for
+/// it but the end and whoever asks for the estimate's Gaussians.
+///
+/// # Errors
+/// [`FlowError::Cancelled`] where `progress` says so; settings and views that cannot be used.
 pub fn reconstruct(
     checkpoint: &Checkpoint,
     objects: &[&[View]],
@@ -284,9 +373,12 @@ pub fn reconstruct(
     config: &SampleConfig,
     seeds: &[u64],
     device: &Device,
-    mut progress: impl FnMut(&Step),
+    mut progress: impl FnMut(&Estimate<'_>) -> ControlFlow<()>,
 ) -> Result<Vec<Vec<Cloud>>, FlowError> {
     config.validate()?;
+    if objects.is_empty() || seeds.is_empty() {
+        return Ok(vec![Vec::new(); objects.len()]);
+    }
     let (depth, fewest) = (config.depth.unwrap_or(checkpoint.depth), checkpoint.config.gaussians_per_token);
     if 1usize << depth < fewest {
         let expected = format!("at least {}: a token of the model is {fewest} Gaussians", fewest.ilog2());
@@ -305,7 +397,7 @@ pub fn reconstruct(
     let photometric = Photometric::new(&checkpoint.normalization, device);
     let rms = Tensor::<1>::from_floats(checkpoint.gradient_rms, device).reshape([1, 1, channel::COUNT]);
     let at_size = |size: u32| {
-        let small: Vec<Vec<View>> = objects.iter().map(|o| o.iter().map(|v| shrink(v, size)).collect()).collect();
+        let small = squares(objects, size);
         let small: Vec<Vec<&View>> = small.iter().flat_map(|o| vec![o.iter().collect(); seeds.len()]).collect();
         Images::new(&small, device)
     };
@@ -361,37 +453,60 @@ pub fn reconstruct(
         None => noise,
     };
 
-    let mut previous = guess; // the latest estimate of the clean sample
+    let previous = RefCell::new(guess); // the latest estimate of the clean sample
     let estimate = |step: &Step| {
-        progress(step);
+        let known = previous.borrow().clone();
         let hint = match checkpoint.config.gradient_channels {
             false => None,
             true => {
-                let at = match (config.gradient_at, &previous) {
+                let at = match (config.gradient_at, &known) {
                     (GradientAt::Estimate, Some(estimate)) => estimate.clone(),
                     _ => step.z.clone(),
                 };
                 Some(scale_gradient(photometric.gradient(at, &images.on(&backgrounds[step.index]))?, &rms))
             }
         };
-        let earlier = previous.clone().filter(|_| checkpoint.config.estimate_channels);
+        let observation = match &known {
+            Some(known) if checkpoint.config.observation_channels => {
+                Some(photometric.observe(known.clone(), &images.on(&backgrounds[step.index]))?)
+            }
+            _ => None,
+        };
+        let earlier = known.filter(|_| checkpoint.config.estimate_channels);
         let estimate = if config.guidance == 1.0 {
             let t = Tensor::full([b], step.t, device);
-            model.denoise(step.z.clone(), Feedback { gradient: hint, estimate: earlier }, tokens.clone(), t)
+            let feedback = Feedback { gradient: hint, estimate: earlier, observation };
+            model.denoise(step.z.clone(), feedback, tokens.clone(), t)
         } else {
             // Conditional and unconditional branch in one batch.
             let z = step.z.clone().repeat_dim(0, 2);
             let blind = |x: Tensor<3>| Tensor::cat(vec![x.clone(), x.zeros_like()], 0);
             let t = Tensor::full([2 * b], step.t, device);
-            let feedback = Feedback { gradient: hint.map(blind), estimate: earlier.map(blind) };
+            let feedback = Feedback {
+                gradient: hint.map(blind),
+                estimate: earlier.map(blind),
+                observation: observation.map(blind),
+            };
             let out = model.denoise(z, feedback, both.clone(), t);
             classifier_free(out.clone().narrow(0, 0, b), out.narrow(0, b, b), config.guidance)
         };
-        previous = Some(estimate.clone());
+        previous.replace(Some(estimate.clone()));
         Ok(estimate)
     };
     let push = |step: &Step, estimate: &Tensor<3>| {
-        if config.photometric == 0.0 {
+        let told = Estimate {
+            index: step.index,
+            t: step.t,
+            normalized: estimate,
+            photometric: &photometric,
+            seeds: seeds.len(),
+        };
+        if progress(&told).is_break() {
+            return Err(FlowError::Cancelled);
+        }
+        // What the paper returns is the last estimate as the network gives it. A single step would be guided by nothing.
+        let last = step.index + 1 == config.steps && config.steps > 1;
+        if config.photometric == 0.0 || last {
             return Ok(None);
         }
         let targets = guiding.on(&backgrounds[step.index]);
@@ -400,18 +515,13 @@ pub fn reconstruct(
             let gradient = photometric.gradient(moved.clone(), &targets)?;
             moved = moved - config.photometric_step.of(gradient, &rms).mul_scalar(config.photometric);
         }
+        if config.solver == Solver::Hold {
+            previous.replace(Some(moved.clone())); // the sample does not move: what is fed back does
+        }
         Ok(Some(estimate.clone() - moved))
     };
     let estimate = integrate(z, begin, config.steps, config.solver, estimate, push)?;
-
-    let raw = photometric.denormalize(estimate).into_data().try_to_vec::<f32>().map_err(|_| FlowError::NoGradient)?;
-    let cloud = |rows: &[f32]| {
-        let mut cloud = Cloud::from_rows(rows.to_vec());
-        cloud.canonicalize_rotations();
-        cloud
-    };
-    let mut rows = raw.chunks_exact(n * channel::COUNT);
-    Ok(objects.iter().map(|_| rows.by_ref().take(seeds.len()).map(cloud).collect()).collect())
+    clouds(photometric.denormalize(estimate), seeds.len())
 }
 
 /// Largest magnitude of a gradient channel, in units of its root mean square: a few Gaussians have gradients
@@ -440,6 +550,28 @@ mod tests {
         assert_eq!(of(PhotometricStep::Gradient), [2e-4, -6e-6, 9.0]);
         let scaled = of(PhotometricStep::Scaled);
         assert!(scaled.iter().zip([2.0, -2.0, GRADIENT_LIMIT]).all(|(a, b)| (a - b).abs() < 1e-5), "{scaled:?}");
+    }
+
+    #[test]
+    fn a_model_of_fits_starts_from_noise_in_its_own_way() {
+        let noise = FromNoise { steps: 30, solver: Solver::Multistep, photometric: 0.2 };
+        let fit = SampleConfig {
+            steps: 4,
+            solver: Solver::Hold,
+            start: Some(StartConfig::default()),
+            photometric: 0.0,
+            from_noise: Some(noise),
+            ..SampleConfig::default()
+        };
+        fit.validate().unwrap();
+        let found = fit.clone().without_start();
+        found.validate().unwrap();
+        assert_eq!((found.steps, found.solver, found.photometric), (30, Solver::Multistep, 0.2));
+        assert!(found.start.is_none());
+        assert_eq!(found.clone().without_start(), found);
+        let held = SampleConfig { from_noise: None, ..fit }.without_start();
+        let message = held.validate().unwrap_err().to_string();
+        assert!(message.contains("sample.solver") && message.contains("hold"), "{message}");
     }
 
     fn error(solver: Solver, steps: usize) -> f32 {

@@ -10,7 +10,7 @@ use crate::{
     FlowError,
     batch::Batch,
     config::LossConfig,
-    path::{flow_loss, interpolate, render_weight},
+    path::{flow_loss, interpolate},
     photometric::Photometric,
     sample::{GradientAt, scale_gradient},
 };
@@ -61,14 +61,21 @@ pub fn step(
             g.square().reshape([b * n, c]).mean_dim(0).reshape([c])
         });
         let gradient = gradient.map(|g| scale_gradient(g, gradient_rms) * batch.conditional.clone());
+        let observation = match &earlier {
+            Some(earlier) if model.dit().observation_channels() => {
+                Some(photometric.observe(earlier.clone(), &batch.hint)?)
+            }
+            _ => None,
+        };
+        let observation = observation.map(|o| o * batch.conditional.clone());
         let estimate = earlier.filter(|_| model.dit().estimate_channels());
-        Ok((Feedback { gradient, estimate }, square))
+        Ok((Feedback { gradient, estimate, observation }, square))
     };
     let mut earlier = batch.fits;
-    if batch.self_conditioned {
-        let (first, _) = feedback(earlier)?;
+    for _ in 0..batch.estimates {
+        let (known, _) = feedback(earlier)?;
         let plain = model.clone().valid();
-        earlier = Some(plain.denoise(noisy.clone(), first, tokens.clone().inner(), t.clone()));
+        earlier = Some(plain.denoise(noisy.clone(), known, tokens.clone().inner(), t.clone()));
     }
     let (feedback, gradient_square) = feedback(earlier)?;
     let estimate = model.denoise(noisy, feedback, tokens, t.clone()); // z1_hat
@@ -86,8 +93,7 @@ pub fn step(
         (true, Some(targets)) => photometric.l1(estimate, targets)?,
         _ => zero(),
     };
-    let weights: Vec<f32> = batch.t.iter().map(|&t| render_weight(t)).collect();
-    let weight = Tensor::<1>::from_floats(weights.as_slice(), device);
+    let weight = Tensor::<1>::from_floats(batch.render_weights.as_slice(), device);
     let total = (flow.clone() + (seen.clone() + held.clone()) * weight).mean();
     Ok(Losses {
         total,

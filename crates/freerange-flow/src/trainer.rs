@@ -13,17 +13,19 @@ use burn::{
     tensor::{Device, Tensor},
 };
 use freerange_data::{Generated, Object, ObjectSource, Shards, Split, Store, Stream};
-use freerange_model::{Checkpoint, Compute, FreeRange, ModelConfig};
+use freerange_model::{Checkpoint, Compute, Dinov2, EncoderConfig, FreeRange, ModelConfig, WeightsOrigin};
 use freerange_splat::{Normalization, Statistics, channel, sync_folder, sync_tree};
 use rand::seq::index::sample as sample_indices;
 
 use crate::{
     FlowError,
-    batch::{Batch, step_rng},
+    batch::{Batch, part_rng, step_rng},
     config::TrainConfig,
+    inherit::is_path,
     optimizer::{AdamW, Flat, Step},
     photometric::Photometric,
     train,
+    validation::{Figures, Validation},
     weights::Weights,
 };
 
@@ -60,6 +62,28 @@ pub struct Report {
     pub broken: u64,
 }
 
+/// What is reported after a measurement on objects that training does not see.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct Validated {
+    /// Steps taken so far.
+    pub step: u64,
+    /// Samples seen so far.
+    pub seen_samples: u64,
+    /// What was measured.
+    pub validation: Figures,
+    /// The best measurement so far, this one included, which `best.safetensors` is of.
+    pub best: Best,
+}
+
+/// The best measurement of a run.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct Best {
+    /// Steps taken by then.
+    pub step: u64,
+    /// [`Figures::psnr`].
+    pub psnr: f64,
+}
+
 /// The part of the state that is neither weights nor optimiser.
 #[derive(Clone, Debug, serde::Serialize, serde::Deserialize)]
 struct Progress {
@@ -79,6 +103,21 @@ struct Progress {
     /// Steps whose loss or gradients were not finite.
     #[serde(default)]
     skipped: u64,
+    /// The best measurement so far.
+    #[serde(default)]
+    best: Option<Best>,
+    /// The frozen encoder's weights; none of an encoder of its own, or of random ones.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    encoder: Option<WeightsOrigin>,
+}
+
+/// Published weights of a frozen encoder.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct EncoderWeights {
+    /// What they are known by: see [`Dinov2Config::weights`](freerange_model::Dinov2Config::weights).
+    pub name: String,
+    /// Where they lie.
+    pub folder: PathBuf,
 }
 
 /// Weights that a new run starts from.
@@ -95,7 +134,8 @@ pub struct Initial<'a> {
 pub struct Trainer {
     config: TrainConfig,
     device: Device,           // the plain one
-    model: Option<FreeRange>, // none only while the optimiser changes it
+    model: Option<FreeRange>, // without the frozen encoder; none only while the optimiser changes it
+    frozen: Option<Dinov2>,
     average: Weights,
     optimizer: AdamW,
     progress: Progress,
@@ -105,6 +145,7 @@ pub struct Trainer {
     window: VecDeque<(u64, Arc<Object>)>,    // with their numbers
     ahead: Option<Result<Batch, FlowError>>, // of the next step
     not_finite: u32,                         // steps in a row
+    validation: Option<Validation>,
     folder: PathBuf,
 }
 
@@ -112,37 +153,74 @@ impl Trainer {
     /// Starts a run in `folder`, or goes on with the one that is there.
     ///
     /// `initial`: weights to start a new run from; ignored by a run that goes on.
+    ///
+    /// # Errors
+    /// Settings, data or a state that cannot be used; a frozen encoder without weights.
     pub fn open(
         config: TrainConfig,
         folder: &Path,
         initial: Option<Initial>,
         device: &Device,
+        progress: impl FnMut(&str),
+    ) -> Result<Self, FlowError> {
+        Self::open_with(config, folder, initial, None, device, progress)
+    }
+
+    /// [`open`](Self::open) with the weights of a frozen encoder.
+    ///
+    /// # Errors
+    /// As [`open`](Self::open).
+    pub fn open_with(
+        config: TrainConfig,
+        folder: &Path,
+        initial: Option<Initial>,
+        encoder: Option<&EncoderWeights>,
+        device: &Device,
         mut progress: impl FnMut(&str),
     ) -> Result<Self, FlowError> {
         config.validate()?;
+        let plain = device.clone().inner();
+        let tracked = plain.clone().autodiff();
+        // Where nothing is differentiated, and features are those of sampling to the bit.
+        let encoder = load_encoder(&config.model.encoder, encoder, &plain, &mut progress)?;
+        let origin = encoder.as_ref().and_then(|e| e.origin().cloned());
         if let Some(Initial { checkpoint, .. }) = initial {
             require_same_model(&config.model, &checkpoint.config)?;
+            let theirs = checkpoint.model.encoder().dinov2().and_then(Dinov2::origin);
+            require_same_encoder(theirs, origin.as_ref(), || "the initial checkpoint".into())?;
         }
-        let plain = device.clone().inner();
         let source: Arc<dyn ObjectSource> = match &config.data.shards {
             Some(place) => {
                 let open = if config.data.partial { Shards::open_finished } else { Shards::open };
                 let shards = open(&Store::open(place)?, &config.depths(), Some(Split::Train))?;
                 Arc::new(shards.shuffled_by(config.seed))
             }
-            None => Arc::new(Generated {
-                config: config.data.object.clone(),
-                depths: config.depths(),
-                seed: config.seed.wrapping_mul(1 << 32),
+            None => Arc::new(generated(&config, 0)),
+        };
+        let validation = match config.validation.every {
+            0 => None,
+            _ => Some(match &config.data.shards {
+                Some(place) => {
+                    let open = if config.data.partial { Shards::open_finished } else { Shards::open };
+                    let shards = open(&Store::open(place)?, &config.depths(), Some(Split::Validation))?;
+                    Validation::new(&shards, shards.len() as u64, config.validation.objects, config.seed)?
+                }
+                None => {
+                    let other = generated(&config, 1 << 31); // farther than training comes
+                    Validation::new(&other, u64::MAX, config.validation.objects, config.seed)?
+                }
             }),
         };
         // Not before the data are there: a folder that holds a configuration belongs to a run.
         std::fs::create_dir_all(folder).map_err(|source| FlowError::Io { path: folder.into(), source })?;
         check_same_run(&config, folder)?;
-        let tracked = plain.clone().autodiff();
-        let mut model = FreeRange::new(&config.model, &mut step_rng(config.seed, u64::MAX), &tracked)?
-            .with_compute(config.optimizer.compute)
-            .with_recompute(config.optimizer.recompute);
+        let mut model = FreeRange::new(&config.model, &mut step_rng(config.seed, u64::MAX), &tracked)?;
+        if let Some(encoder) = encoder {
+            model = model.with_dinov2(&config.model, encoder)?;
+        }
+        // States and averages are of what is trained.
+        let (mut model, frozen) =
+            model.with_compute(config.optimizer.compute).with_recompute(config.optimizer.recompute).take_dinov2();
         let saved = latest_state(folder)?;
         let (state, average, optimizer) = match &saved {
             Some(path) => {
@@ -160,12 +238,14 @@ impl Trainer {
                 let text =
                     std::fs::read_to_string(&file).map_err(|source| FlowError::Io { path: file.clone(), source })?;
                 let progress = serde_json::from_str::<Progress>(&text)
-                    .map_err(|e| FlowError::State { path: file, problem: e.to_string() })?;
+                    .map_err(|e| FlowError::State { path: file.clone(), problem: e.to_string() })?;
+                let run = || format!("the run, in {}", file.display());
+                require_same_encoder(progress.encoder.as_ref(), origin.as_ref(), run)?;
                 (progress, average, optimizer)
             }
             None => {
                 if let Some(Initial { checkpoint, .. }) = initial {
-                    model = Weights::of(&checkpoint.model).apply(model);
+                    model = Weights::of(&checkpoint.model.clone().take_dinov2().0).apply(model);
                 }
                 let normalization = match initial {
                     Some(Initial { checkpoint, remeasure: false }) => checkpoint.normalization.clone(),
@@ -194,6 +274,8 @@ impl Trainer {
                     first_object: Some(0),
                     broken: 0,
                     skipped: 0,
+                    best: None,
+                    encoder: origin,
                 };
                 let average = Weights::of(&model);
                 let optimizer = AdamW::new(average.0.len());
@@ -211,6 +293,7 @@ impl Trainer {
             config,
             device: plain,
             model: Some(model),
+            frozen,
             average,
             optimizer,
             broken: state.broken,
@@ -219,6 +302,7 @@ impl Trainer {
             window,
             ahead: None,
             not_finite: 0,
+            validation,
             folder: folder.into(),
         })
     }
@@ -237,8 +321,8 @@ impl Trainer {
         self.model.as_ref().expect("a step gives it back")
     }
 
-    /// The batch of step `index`, which must be the first or follow the one before.
-    fn draw(&mut self, index: u64) -> Result<Batch, FlowError> {
+    /// Part `part` of the batch of step `index`, which must be the first or follow the one before.
+    fn draw(&mut self, index: u64, part: usize) -> Result<Batch, FlowError> {
         let stage = self.config.stage(index);
         let mut rng = step_rng(self.config.seed, index);
         let count = self.window.len();
@@ -248,14 +332,18 @@ impl Trainer {
             }
             false => (0..stage.batch).map(|i| self.window[i % count].1.clone()).collect(),
         };
+        let chosen = chosen.chunks(stage.at_a_time()).nth(part).expect("a part of the batch");
         let model_config = ModelConfig { image_size: stage.image_size, ..self.config.model.clone() };
         let loss = &self.config.loss;
+        let mut rng = part_rng(rng, part);
         let batch =
-            Batch::draw(&chosen, stage, &model_config, loss, &self.progress.normalization, &mut rng, &self.device)?;
-        for _ in 0..self.config.data.fresh {
-            let (i, object) = self.stream.take_next()?;
-            self.window.push_back((i, Arc::new(object)));
-            self.window.pop_front();
+            Batch::draw(chosen, stage, &model_config, loss, &self.progress.normalization, &mut rng, &self.device)?;
+        if part + 1 == stage.parts() {
+            for _ in 0..self.config.data.fresh {
+                let (i, object) = self.stream.take_next()?;
+                self.window.push_back((i, Arc::new(object)));
+                self.window.pop_front();
+            }
         }
         Ok(batch)
     }
@@ -266,30 +354,55 @@ impl Trainer {
     pub fn step(&mut self) -> Result<Report, FlowError> {
         let begin = Instant::now();
         let index = self.progress.step;
-        let batch = match self.ahead.take() {
-            Some(batch) => batch?,
-            None => self.draw(index)?,
-        };
-        let mut data_seconds = begin.elapsed().as_secs_f64();
-
+        let (stage, total_steps) = (self.config.stage(index).clone(), self.config.total_steps());
+        let mut data_seconds = 0.0;
         let rms = Tensor::<1>::from_floats(self.gradient_rms(), &self.device).reshape([1, 1, channel::COUNT]);
-        let losses = train::step(self.model(), batch, &self.photometric, &rms, &self.config.loss, &self.device)?;
-        let mut gradients = Flat::of(&mut losses.total.clone().backward(), self.model());
-        let norm = gradients.norm(&self.device);
-        let first_object = self.window.front().map(|(number, _)| *number);
-        // A GPU has only been told by now what to do: the next batch is made while it works.
-        if index + 1 < self.config.total_steps() {
+        // Of the step: means over its parts, each by its share of the objects.
+        let mut sums: Option<(Flat, Tensor<1>)> = None;
+        let mut first_object = None;
+        for part in 0..stage.parts() {
             let begin = Instant::now();
-            self.ahead = Some(self.draw(index + 1));
+            let batch = match self.ahead.take() {
+                Some(batch) => batch?,
+                None => self.draw(index, part)?,
+            };
+            data_seconds += begin.elapsed().as_secs_f64();
+            let share = batch.t.len() as f32 / stage.batch as f32;
+            // Gone before the optimiser, which changes weights in place that nobody else holds.
+            let whole = self.model().clone().put_dinov2(self.frozen.clone());
+            let losses = train::step(&whole, batch, &self.photometric, &rms, &self.config.loss, &self.device)?;
+            drop(whole);
+            let mut figures = vec![losses.total.clone().inner(), losses.flow, losses.seen, losses.held];
+            figures.extend(losses.gradient_square);
+            let (mut total, mut figures) = (losses.total, Tensor::cat(figures, 0));
+            if stage.parts() > 1 {
+                (total, figures) = (total.mul_scalar(share), figures.mul_scalar(share));
+            }
+            let gradients = Flat::of(&mut total.backward(), self.model());
+            sums = Some(match sums {
+                None => (gradients, figures),
+                Some((sum, before)) => (sum.add(gradients), before + figures),
+            });
+            // A GPU has only been told by now what to do: the next objects are made ready while it works.
+            let begin = Instant::now();
+            if part + 1 < stage.parts() {
+                self.ahead = Some(self.draw(index, part + 1));
+            } else {
+                first_object = self.window.front().map(|(number, _)| *number);
+                if index + 1 < total_steps {
+                    self.ahead = Some(self.draw(index + 1, 0));
+                }
+            }
             data_seconds += begin.elapsed().as_secs_f64();
         }
+        let (mut gradients, figures) = sums.expect("a batch has a part");
+        let norm = gradients.norm(&self.device);
         // One transfer for all figures: each would wait for the device.
-        let mut figures = vec![losses.total.inner(), losses.flow, losses.seen, losses.held, norm];
-        figures.extend(losses.gradient_square);
-        let figures = Tensor::cat(figures, 0).into_data().try_to_vec::<f32>().map_err(|_| FlowError::NoGradient)?;
-        let (&[total, flow, seen, held, norm], square) = figures.split_first_chunk().ok_or(FlowError::NoGradient)?;
+        let figures =
+            Tensor::cat(vec![norm, figures], 0).into_data().try_to_vec::<f32>().map_err(|_| FlowError::NoGradient)?;
+        let (&[norm, total, flow, seen, held], square) = figures.split_first_chunk().ok_or(FlowError::NoGradient)?;
         let o = &self.config.optimizer;
-        let rate = o.rate(index, self.config.total_steps());
+        let rate = o.rate(index, total_steps);
         let finite = figures.iter().all(|x| x.is_finite());
         if finite {
             let applied = self.progress.step - self.progress.skipped;
@@ -331,6 +444,31 @@ impl Trainer {
         })
     }
 
+    /// Measures the averaged weights, if that is due after the steps so far; `best.safetensors` are those of the best
+    /// measurement.
+    pub fn validate(&mut self) -> Result<Option<Validated>, FlowError> {
+        let (step, every) = (self.progress.step, self.config.validation.every);
+        let Some(validation) = self.validation.as_ref().filter(|_| step > 0 && step.is_multiple_of(every)) else {
+            return Ok(None);
+        };
+        let tracked = self.average.apply(self.model().clone()).put_dinov2(self.frozen.clone());
+        let checkpoint = self.checkpoint(self.averaged())?;
+        let stage = self.config.stage(step - 1);
+        let figures = validation.measure(&checkpoint, &tracked, &self.config, stage, &self.device)?;
+        let found = Best { step, psnr: figures.psnr };
+        let best = self.progress.best.filter(|best| best.psnr >= found.psnr).unwrap_or(found);
+        if best == found {
+            checkpoint.save(&self.folder.join("best.safetensors"))?;
+        }
+        self.progress.best = Some(best);
+        Ok(Some(Validated { step, seen_samples: self.samples(), validation: figures, best }))
+    }
+
+    /// The model with the averaged weights. Sampling chooses its own arithmetic.
+    fn averaged(&self) -> FreeRange {
+        self.average.apply(self.model().clone().valid()).with_compute(Compute::F32).with_recompute(false)
+    }
+
     /// Moves the averages after a step that was applied. `square`: the mean square of the gradient's channels in it.
     fn follow(&mut self, square: &[f32]) {
         let applied = (self.progress.step - self.progress.skipped) as f32;
@@ -365,8 +503,7 @@ impl Trainer {
         }
         std::fs::create_dir_all(&partial).map_err(io(&partial))?;
         let broken = |name: &str, e: String| FlowError::State { path: partial.join(name), problem: e };
-        // Sampling chooses its own arithmetic.
-        let average = self.average.apply(self.model().clone().valid()).with_compute(Compute::F32).with_recompute(false);
+        let average = self.averaged();
         let model = self.model().clone().into_record();
         model.save(partial.join("model")).map_err(|e| broken("model", e.to_string()))?;
         let record = average.clone().into_record();
@@ -395,7 +532,7 @@ impl Trainer {
     /// The averaged weights with everything that sampling needs.
     fn checkpoint(&self, average: FreeRange) -> Result<Checkpoint, FlowError> {
         let stage = self.config.stage(self.progress.step.saturating_sub(1));
-        let config = ModelConfig { image_size: stage.image_size, ..self.config.model.clone() };
+        let config = ModelConfig { image_size: stage.image_size, ..self.config.model.architecture() };
         let provenance = serde_json::json!({
             "configuration": self.config,
             "steps": self.progress.step,
@@ -406,7 +543,7 @@ impl Trainer {
         });
         Ok(Checkpoint {
             config,
-            model: average,
+            model: average.put_dinov2(self.frozen.clone()),
             normalization: self.progress.normalization.clone(),
             gradient_rms: self.gradient_rms(),
             depth: stage.depth,
@@ -423,6 +560,12 @@ impl Trainer {
             sum + steps * stage.batch as u64
         })
     }
+}
+
+/// Objects made on the fly, from the run's seeds on or so many farther.
+fn generated(config: &TrainConfig, farther: u64) -> Generated {
+    let seed = config.seed.wrapping_mul(1 << 32).wrapping_add(farther);
+    Generated { config: config.data.object.clone(), depths: config.depths(), seed }
 }
 
 /// Normalisation statistics over the first `count` objects at `depth`.
@@ -444,8 +587,9 @@ fn measure(source: &dyn ObjectSource, count: u64, depth: u32) -> Result<Normaliz
 
 /// Weights fit only the architecture they were trained in; the image size may differ.
 fn require_same_model(model: &ModelConfig, given: &ModelConfig) -> Result<(), FlowError> {
-    let given = ModelConfig { image_size: model.image_size, ..given.clone() };
-    if given == *model {
+    let given = ModelConfig { image_size: model.image_size, ..given.architecture() };
+    let model = model.architecture();
+    if given == model {
         return Ok(());
     }
     Err(FlowError::Config {
@@ -455,27 +599,96 @@ fn require_same_model(model: &ModelConfig, given: &ModelConfig) -> Result<(), Fl
     })
 }
 
+/// The frozen encoder, on `device`; `Ok(None)` where there is none, or a random one will do.
+fn load_encoder(
+    config: &EncoderConfig,
+    weights: Option<&EncoderWeights>,
+    device: &Device,
+    progress: &mut impl FnMut(&str),
+) -> Result<Option<Dinov2>, FlowError> {
+    let refuse = |field: &str, expected: &str, found: &str| {
+        Err(FlowError::Config { field: field.into(), expected: expected.into(), found: found.into() })
+    };
+    match (config, weights) {
+        (EncoderConfig::Patch(_), None) => Ok(None),
+        (EncoderConfig::Patch(_), Some(_)) => {
+            refuse("model.encoder.kind", "\"dinov2\" where encoder weights are given", "\"patch\"")
+        }
+        (EncoderConfig::Dinov2(c), None) if c.random => {
+            progress(
+                "WARNING: the frozen encoder is random (model.encoder.random): a dry run, whose model is of no use",
+            );
+            Ok(None)
+        }
+        (EncoderConfig::Dinov2(c), Some(_)) if c.random => {
+            refuse("model.encoder.random", "false where encoder weights are given", "true")
+        }
+        (EncoderConfig::Dinov2(_), None) => refuse(
+            "model.encoder.weights",
+            "the weights of the frozen encoder, a folder or \"hf:owner/name\" (or random = true, for dry runs)",
+            "none",
+        ),
+        (EncoderConfig::Dinov2(c), Some(weights)) => {
+            let encoder = Dinov2::load_as(&weights.folder, &weights.name, device)?;
+            if c.architecture() != *encoder.config() {
+                let expected =
+                    format!("the architecture of the weights in {}, {:?}", weights.folder.display(), encoder.config());
+                return refuse("model.encoder", &expected, &format!("{:?}", c.architecture()));
+            }
+            if let Some(origin) = encoder.origin() {
+                progress(&format!("encoder weights {} (sha256 {})", origin.name, origin.sha256));
+            }
+            Ok(Some(encoder))
+        }
+    }
+}
+
+/// What was trained with some features is of no use with others.
+fn require_same_encoder(
+    theirs: Option<&WeightsOrigin>,
+    ours: Option<&WeightsOrigin>,
+    who: impl FnOnce() -> String,
+) -> Result<(), FlowError> {
+    if theirs.map(|w| &w.sha256) == ours.map(|w| &w.sha256) {
+        return Ok(());
+    }
+    let text = |w: Option<&WeightsOrigin>| w.map_or("none".into(), |w| format!("{} (sha256 {})", w.name, w.sha256));
+    Err(FlowError::Config {
+        field: "model.encoder.weights".into(),
+        expected: format!("those of {}, {}", who(), text(theirs)),
+        found: text(ours),
+    })
+}
+
 /// A run's folder holds its configuration: going on with another one would mix two runs.
 fn check_same_run(config: &TrainConfig, folder: &Path) -> Result<(), FlowError> {
     let path = folder.join("config.toml");
     let mut kept = config.clone();
     // Whoever reads that file, or goes on with the run from another folder, must find the same shards.
     kept.data.shards = kept.data.shards.map(|place| local(&place, |path| std::path::absolute(path)));
+    if let EncoderConfig::Dinov2(encoder) = &mut kept.model.encoder {
+        encoder.weights = encoder.weights.take().map(|place| local(&place, |path| std::path::absolute(path)));
+    }
     let text =
         toml::to_string_pretty(&kept).map_err(|e| FlowError::State { path: path.clone(), problem: e.to_string() })?;
     match std::fs::read_to_string(&path) {
         Ok(old) => {
             let old: TrainConfig =
                 toml::from_str(&old).map_err(|e| FlowError::State { path: path.clone(), problem: e.to_string() })?;
-            // Running longer is no other run; neither is sampling otherwise, or with more threads.
+            // Running longer is no other run; neither is sampling or measuring otherwise, or with more threads.
             let essence = |c: &TrainConfig| {
                 let mut c = c.clone();
                 c.stages.iter_mut().for_each(|s| s.steps = 0);
                 c.sample = Default::default();
                 c.data.workers = 0;
+                // The weights may have moved; the state knows which ones they are.
+                if let EncoderConfig::Dinov2(encoder) = &mut c.model.encoder {
+                    encoder.weights = None;
+                }
                 c.data.shards = c.data.shards.map(|place| local(&place, |path| path.canonicalize()));
                 c.optimizer.compute = Default::default();
                 c.optimizer.schedule = Default::default();
+                c.validation = Default::default();
                 c
             };
             if essence(&old) != essence(config) {
@@ -489,9 +702,9 @@ fn check_same_run(config: &TrainConfig, folder: &Path) -> Result<(), FlowError> 
     std::fs::write(&path, text).map_err(|source| FlowError::Io { path, source })
 }
 
-/// The path of a folder of shards otherwise said by `say`; URLs, and what cannot be said, as they are.
+/// The path of a folder otherwise said by `say`; URLs and the like, and what cannot be said, as they are.
 fn local(place: &str, say: impl Fn(&Path) -> std::io::Result<PathBuf>) -> String {
-    let path = (!place.contains("://")).then(|| say(Path::new(place)).ok()).flatten();
+    let path = is_path(place).then(|| say(Path::new(place)).ok()).flatten();
     path.and_then(|path| path.to_str().map(str::to_owned)).unwrap_or_else(|| place.to_owned())
 }
 

@@ -13,7 +13,7 @@ use freerange_flow::{
 };
 use freerange_model::{Checkpoint, FreeRange};
 use freerange_splat::{Normalization, Statistics};
-use std::sync::Arc;
+use std::{ops::ControlFlow, sync::Arc};
 
 const SMALL: &str = r#"
 seed = 3
@@ -131,7 +131,9 @@ fn gpu_samples_as_the_cpu_does() {
             depth: 5,
             provenance: serde_json::Value::Null,
         };
-        let clouds = reconstruct(&checkpoint, &views, None, &config.sample, &[1, 2], device, |_| {}).unwrap();
+        let clouds =
+            reconstruct(&checkpoint, &views, None, &config.sample, &[1, 2], device, |_| ControlFlow::Continue(()))
+                .unwrap();
         assert_eq!(clouds.iter().map(Vec::len).collect::<Vec<_>>(), [2, 2]);
         clouds.iter().flatten().flat_map(|c| c.rows().to_vec()).collect::<Vec<f32>>()
     };

@@ -1,15 +1,16 @@
 //! The whole road on one object: train, save, load, sample, render. The guard against silent breakage.
 
-use std::sync::Arc;
+use std::{ops::ControlFlow, sync::Arc};
 
 use burn::tensor::Device;
 use freerange_camera::{View, image_ops::composite};
 use freerange_data::{Generated, ObjectSource};
 use freerange_flow::{
+    FlowError,
     batch::{Batch, step_rng},
     config::{FrameJitter, TrainConfig},
     photometric::{Photometric, Targets},
-    sample::{PhotometricStep, SampleConfig, reconstruct},
+    sample::{Estimate, PhotometricStep, SampleConfig, reconstruct},
     trainer::{Initial, Trainer},
 };
 use freerange_metrics::psnr;
@@ -92,6 +93,10 @@ fn train(config: &TrainConfig, folder: &std::path::Path, stop_at: u64) -> Vec<f3
     losses
 }
 
+fn go(_: &Estimate<'_>) -> ControlFlow<()> {
+    ControlFlow::Continue(())
+}
+
 /// Mean PSNR of renders of `rows` against `views`, on white.
 fn quality(rows: &[f32], views: &[View]) -> f64 {
     let cameras: Vec<_> = views.iter().map(|v| v.camera).collect();
@@ -122,7 +127,7 @@ fn one_object_is_learned_sampled_and_rendered() {
     };
     let object = source.object(0).unwrap();
     let (inputs, unseen) = object.views.split_at(4);
-    let clouds = reconstruct(&checkpoint, &[inputs], None, &config.sample, &[5, 6], &device, |_| {}).unwrap().remove(0);
+    let clouds = reconstruct(&checkpoint, &[inputs], None, &config.sample, &[5, 6], &device, go).unwrap().remove(0);
     assert_eq!(clouds.len(), 2);
     assert_ne!(clouds[0], clouds[1], "another seed is another sample");
 
@@ -154,7 +159,7 @@ fn one_object_is_learned_sampled_and_rendered() {
             photometric_size,
             ..config.sample.clone()
         };
-        reconstruct(&checkpoint, &[inputs], None, &guidance, &[5], &device, |_| {}).unwrap().remove(0).remove(0)
+        reconstruct(&checkpoint, &[inputs], None, &guidance, &[5], &device, go).unwrap().remove(0).remove(0)
     });
     for (i, a) in sampled[..5].iter().enumerate() {
         assert!(sampled[..i].iter().all(|b| a != b), "each way is another one");
@@ -162,13 +167,36 @@ fn one_object_is_learned_sampled_and_rendered() {
     assert_eq!((config.sample.photometric_step, config.sample.photometric_repeats), (PhotometricStep::Gradient, 1));
     assert_eq!(sampled[5], sampled[2], "gradient_size is what a left out photometric_size means");
 
+    // A single step is guided, too: its result is.
+    let single = |photometric: f32| {
+        let one = SampleConfig { steps: 1, photometric, ..config.sample.clone() };
+        reconstruct(&checkpoint, &[inputs], None, &one, &[5], &device, go).unwrap().remove(0).remove(0)
+    };
+    assert_ne!(single(0.0), single(50.0));
+
+    // Every step's estimate is told, the last of which is the result, and whoever is told can stop it.
+    let mut told = Vec::new();
+    let result = reconstruct(&checkpoint, &[inputs], None, &config.sample, &[5, 6], &device, |step| {
+        told.push((step.index, step.clouds().unwrap()));
+        ControlFlow::Continue(())
+    });
+    assert_eq!(told.iter().map(|(index, _)| *index).collect::<Vec<_>>(), (0..20).collect::<Vec<_>>());
+    assert_eq!(told[19].1, result.unwrap());
+    assert_ne!(told[18].1, told[19].1);
+    let mut steps = 0;
+    let stopped = reconstruct(&checkpoint, &[inputs], None, &config.sample, &[5], &device, |step| {
+        steps += 1;
+        if step.index == 2 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    });
+    assert!(matches!(stopped, Err(FlowError::Cancelled)) && steps == 3);
+
     // Another batch: two objects (the second sees other views), one seed.
-    let both = reconstruct(&checkpoint, &[inputs, unseen], None, &config.sample, &[5], &device, |_| {}).unwrap();
+    let both = reconstruct(&checkpoint, &[inputs, unseen], None, &config.sample, &[5], &device, go).unwrap();
     let worst = |a: &Cloud, b: &Cloud| a.rows().iter().zip(b.rows()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
     assert_eq!(both.iter().map(Vec::len).collect::<Vec<_>>(), [1, 1]);
     let off = worst(&both[0][0], &clouds[0]);
     assert!(off < 1e-2, "the same seed in another batch gives the same sample, up to rounding: off by {off}");
-    let alone = reconstruct(&checkpoint, &[unseen], None, &config.sample, &[5], &device, |_| {}).unwrap();
+    let alone = reconstruct(&checkpoint, &[unseen], None, &config.sample, &[5], &device, go).unwrap();
     assert!(worst(&both[1][0], &alone[0][0]) < 1e-2);
     assert_ne!(both[0][0], both[1][0]);
 }
@@ -267,4 +295,91 @@ fn a_moved_frame_changes_nothing_that_is_seen() {
     }
     assert!(shifts.iter().all(|s| s.abs() > 1e-4 && s.abs() <= 0.2 + 1e-5), "{shifts:?}");
     assert!(shifts.iter().any(|s| (s - shifts[0]).abs() > 1e-3), "each draw is another one: {shifts:?}");
+}
+
+/// Training at the start, from a fit to what it should have been, and sampling that stays there.
+#[test]
+fn a_fit_is_mended() {
+    let place = tempfile::tempdir().unwrap();
+    let text = ONE_OBJECT
+        .replace("STEPS", "160")
+        .replace("warmup = 20", "warmup = 5")
+        .replace("batch = 8", "batch = 4")
+        .replace("views = 8", "views = 16\ninput_fits = 1\nquick_fit = { iterations = 60, gaussians = 64, render_size = 32 }")
+        .replace(
+            "[model]",
+            "[model]\nestimate_channels = true\nobservation_channels = true\npreconditioning = [0.1, 0.1, 0.1, 0.5, 0.5, 0.5, \
+             0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5]",
+        )
+        .replace(
+            "[loss]",
+            "[loss]\nself_conditioning = 0.5\nestimates = 2\ngradient_at = \"estimate\"\n\
+             start = { share = 1.0, time = 0.0, noise = 0.0, hold = 1.0, render = 50.0 }",
+        )
+        .replace(
+            "steps = 20\n",
+            "steps = 3\nsolver = \"hold\"\ngradient_at = \"estimate\"\nphotometric = 0.0\n\
+             start = { time = 0.0, noise = 0.0, fit = { iterations = 60, gaussians = 64, render_size = 32 } }\n",
+        );
+    let config: TrainConfig = toml::from_str(&text).unwrap();
+    config.validate().unwrap();
+    let source = Generated {
+        config: config.data.object.clone(),
+        depths: config.depths(),
+        seed: config.seed.wrapping_mul(1 << 32),
+    };
+    let object = Arc::new(source.object(0).unwrap());
+    let device = Device::flex();
+    let [stage] = config.stages.as_slice() else { panic!("one stage") };
+
+    // At the start nothing shows where the sample should go: it is the fit without noise.
+    let normalization = Normalization { mean: [0.0; channel::COUNT], std: [1.0; channel::COUNT] };
+    let objects = [object.clone()];
+    let draw = |seed, device: &Device| {
+        let rng = &mut step_rng(seed, 0);
+        Batch::draw(&objects, stage, &config.model, &config.loss, &normalization, rng, device).unwrap()
+    };
+    let drawn: Vec<Batch> = (0..12).map(|seed| draw(seed, &device)).collect();
+    for batch in &drawn {
+        let values = |t: &burn::tensor::Tensor<3>| t.clone().into_data().try_to_vec::<f32>().unwrap();
+        assert_eq!((batch.t.as_slice(), batch.render_weights.as_slice()), ([0.0].as_slice(), [50.0].as_slice()));
+        assert!(values(&batch.noise).iter().all(|&e| e == 0.0));
+        assert_eq!(values(batch.fits.as_ref().unwrap()), object.input_fits[0].gaussians.rows());
+        assert_eq!(values(&batch.data), object.input_fits[0].mended.rows());
+    }
+    for count in 0..=2 {
+        assert!(drawn.iter().any(|batch| batch.estimates == count), "{count} estimates are drawn now and then");
+    }
+
+    train(&config, place.path(), 160);
+    let checkpoint = Checkpoint::load(&place.path().join("checkpoint.safetensors"), &device).unwrap();
+    let fit = &object.input_fits[0];
+    let (mut inputs, mut unseen) = (Vec::new(), Vec::new());
+    for (i, view) in object.views.iter().enumerate() {
+        if fit.views.contains(&i) { inputs.push(view.clone()) } else { unseen.push(view.clone()) }
+    }
+    let mut steps = 0;
+    let fits = [fit.gaussians.clone()];
+    let sample = |seeds: &[u64], config: &SampleConfig, steps: &mut usize| {
+        reconstruct(&checkpoint, &[&inputs], Some(&fits), config, seeds, &device, |step| {
+            assert_eq!(step.t, 0.0);
+            *steps += 1;
+            ControlFlow::Continue(())
+        })
+        .unwrap()
+        .remove(0)
+    };
+    // The colour behind the object is drawn, and all that a seed changes here.
+    let white = SampleConfig { background: freerange_flow::sample::Background::White, ..config.sample.clone() };
+    let clouds = sample(&[5, 6], &white, &mut steps);
+    assert_eq!(steps, 3);
+    assert_eq!(clouds[0], clouds[1], "without noise there is but one sample");
+    let [from, to, found] = [&fit.gaussians, &fit.mended, &clouds[0]].map(|cloud| quality(cloud.rows(), &unseen));
+    assert!(
+        found > from + 0.4 * (to - from) && to > from + 1.0,
+        "fit {from:.2} dB, mended {found:.2} dB, at best {to:.2} dB"
+    );
+    // A photometric push moves what is fed back.
+    let pushed = sample(&[5], &SampleConfig { photometric: 0.05, ..white }, &mut steps);
+    assert_ne!(pushed[0], clouds[0]);
 }

@@ -105,7 +105,7 @@ impl Checkpoint {
         let mut metadata = HashMap::from([
             ("format".to_owned(), FORMAT.to_owned()),
             ("version".to_owned(), VERSION.to_owned()),
-            ("config".to_owned(), json(serde_json::to_string(&self.config))?),
+            ("config".to_owned(), json(serde_json::to_string(&self.config.architecture()))?),
             ("normalization".to_owned(), json(serde_json::to_string(&self.normalization))?),
             ("gradient_rms".to_owned(), json(serde_json::to_string(&self.gradient_rms))?),
             ("depth".to_owned(), self.depth.to_string()),
@@ -133,12 +133,22 @@ impl Checkpoint {
         Self::load_with(path, Some(dinov2), device)
     }
 
-    /// Reads a checkpoint that is in memory already. `name` stands for the file in messages.
+    /// Reads a checkpoint that is in memory already, with the DINOv2 of its encoder if it has one. `name` stands for the file
+    /// in messages.
+    ///
+    /// # Errors
+    /// As [`load`](Self::load) and [`load_with_dinov2`](Self::load_with_dinov2).
+    pub fn from_bytes(bytes: &[u8], name: &Path, dinov2: Option<Dinov2>, device: &Device) -> Result<Self, ModelError> {
+        Self::parse(name, bytes, dinov2, device)
+    }
+
+    /// What the metadata of a checkpoint that is in memory say; its weights stay unread, and need no encoder. `name` stands
+    /// for the file in messages.
     ///
     /// # Errors
     /// As [`load`](Self::load).
-    pub fn from_bytes(bytes: &[u8], name: &str, device: &Device) -> Result<Self, ModelError> {
-        Self::parse(Path::new(name), bytes, None, device)
+    pub fn header(bytes: &[u8], name: &Path) -> Result<Header, ModelError> {
+        Header::read(name, bytes)
     }
 
     fn load_with(path: &Path, dinov2: Option<Dinov2>, device: &Device) -> Result<Self, ModelError> {
@@ -156,14 +166,19 @@ impl Checkpoint {
     }
 }
 
-/// What the metadata say.
-struct Header {
-    config: ModelConfig,
+/// What the metadata of a checkpoint say.
+#[derive(Clone, Debug)]
+pub struct Header {
+    /// Sizes of the network.
+    pub config: ModelConfig,
     normalization: Normalization,
     gradient_rms: [f32; CHANNELS],
-    depth: u32,
-    provenance: serde_json::Value,
-    encoder_weights: Option<WeightsOrigin>,
+    /// Tree depth of the training targets.
+    pub depth: u32,
+    /// Free-form: data, steps, hardware.
+    pub provenance: serde_json::Value,
+    /// The frozen encoder weights that it was trained with; none where it has no such encoder, or trained on random ones.
+    pub encoder_weights: Option<WeightsOrigin>,
 }
 
 impl Header {
@@ -212,7 +227,7 @@ impl Header {
         let bad = |reason: String| Err(ModelError::format(path, KIND, reason));
         let wanted = match &self.encoder_weights {
             Some(origin) => format!("`{}` (sha256 {})", origin.name, origin.sha256),
-            None => "DINOv2 (which one is not recorded)".to_owned(),
+            None => "DINOv2 (which ones is not recorded: it was trained on random ones)".to_owned(),
         };
         match (&self.config.encoder, dinov2) {
             (EncoderConfig::Patch(_), None) => Ok(()),

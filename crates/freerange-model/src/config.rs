@@ -8,6 +8,8 @@ use crate::ModelError;
 pub const CHANNELS: usize = freerange_splat::channel::COUNT;
 /// Channels of a Plücker ray: moment, direction.
 pub const PLUCKER: usize = 6;
+/// Channels per Gaussian of what the input views show of it.
+pub const OBSERVATION: usize = 9;
 
 /// Sizes of the whole network. The defaults are the paper's.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -41,6 +43,9 @@ pub struct ModelConfig {
     /// Whether an earlier estimate of the clean Gaussians is one, too (self-conditioning: Chen et al. 2022; not the
     /// paper's). Without one, zeros stand for it.
     pub estimate_channels: bool,
+    /// Whether what the input views show of that estimate is one, too: how much of each Gaussian they see, and in which colours
+    /// (not the paper's). Without an estimate, zeros stand for it.
+    pub observation_channels: bool,
     /// With these, the last layer tells but the correction, of unit variance at all times, to what the noisy Gaussians and
     /// the earlier estimate say together (preconditioning: Karras et al. 2022; not the paper's): standard deviations, one
     /// per channel, of what such estimates are off by, in normalised units. Without an estimate they are 1.
@@ -70,7 +75,7 @@ pub struct PatchConfig {
     pub patch_hidden: usize,
 }
 
-/// Architecture of a DINOv2; the defaults are `facebook/dinov2-base`.
+/// Architecture of a DINOv2; the defaults are `facebook/dinov2-base`. And where its weights lie.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Dinov2Config {
@@ -96,6 +101,14 @@ pub struct Dinov2Config {
     pub qkv_bias: bool,
     /// Whether the position embedding is shrunk with an antialiasing filter (published: only with registers).
     pub antialias: bool,
+    /// Where training finds the published weights: a folder as the Hugging Face hub has it (`config.json` and
+    /// `model.safetensors`; in a file, its path is relative to the file), or `hf:owner/name`. A checkpoint has none of
+    /// this: it records the weights that it was trained with.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub weights: Option<String>,
+    /// Random weights instead, for dry runs of training. What is trained on them is of no use.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub random: bool,
 }
 
 /// What stands before the output projection.
@@ -124,6 +137,7 @@ impl Default for ModelConfig {
             final_layer: FinalLayer::Adaln,
             gradient_channels: true,
             estimate_channels: false,
+            observation_channels: false,
             preconditioning: None,
         }
     }
@@ -149,11 +163,18 @@ impl Default for Dinov2Config {
             layer_norm_eps: 1e-6,
             qkv_bias: true,
             antialias: false,
+            weights: None,
+            random: false,
         }
     }
 }
 
 impl Dinov2Config {
+    /// The same without a word about where weights come from.
+    pub fn architecture(&self) -> Self {
+        Self { weights: None, random: false, ..self.clone() }
+    }
+
     /// Inner width of the feed-forward network. SwiGLU keeps the parameter count: two thirds, rounded up to 8.
     pub fn ffn_width(&self) -> usize {
         let inner = self.hidden * self.mlp_ratio;
@@ -178,11 +199,22 @@ impl Dinov2Config {
         if !(self.layer_norm_eps > 0.0 && self.layer_norm_eps < 1.0) {
             return Err(ModelError::config("encoder.layer_norm_eps", "a number between 0 and 1", self.layer_norm_eps));
         }
+        if self.random && self.weights.is_some() {
+            return Err(ModelError::config("encoder.random", "false with encoder.weights", true));
+        }
         Ok(())
     }
 }
 
 impl EncoderConfig {
+    /// The same without a word about where weights come from.
+    pub fn architecture(&self) -> Self {
+        match self {
+            Self::Patch(c) => Self::Patch(c.clone()),
+            Self::Dinov2(c) => Self::Dinov2(c.architecture()),
+        }
+    }
+
     /// Side of a patch in pixels.
     pub fn patch_size(&self) -> u32 {
         match self {
@@ -210,6 +242,11 @@ impl EncoderConfig {
 }
 
 impl ModelConfig {
+    /// The same without a word about where weights come from.
+    pub fn architecture(&self) -> Self {
+        Self { encoder: self.encoder.architecture(), ..self.clone() }
+    }
+
     /// Inner width of the feed-forward network.
     pub fn ffn_width(&self) -> usize {
         self.ffn.unwrap_or(4 * self.hidden)
@@ -238,7 +275,7 @@ impl ModelConfig {
     /// Width of a Gaussian token before the input projection.
     pub fn gaussian_channels(&self) -> usize {
         let kinds = 1 + usize::from(self.gradient_channels) + usize::from(self.estimate_channels);
-        self.gaussians_per_token * CHANNELS * kinds
+        self.gaussians_per_token * (CHANNELS * kinds + if self.observation_channels { OBSERVATION } else { 0 })
     }
 
     /// Tokens in the transformer for `views` images and `gaussians` Gaussians.
@@ -270,6 +307,10 @@ impl ModelConfig {
         {
             let found = format!("{deviations:?}");
             return Err(ModelError::config("preconditioning", "14 numbers between 0.001 and 1000", found));
+        }
+        if self.observation_channels && !self.estimate_channels {
+            let expected = "false without estimate_channels";
+            return Err(ModelError::config("observation_channels", expected, self.observation_channels));
         }
         match &self.encoder {
             EncoderConfig::Patch(c) => {

@@ -10,7 +10,7 @@ use burn::{
 
 use crate::{
     ModelConfig, ModelError,
-    config::{CHANNELS, FinalLayer},
+    config::{CHANNELS, FinalLayer, OBSERVATION},
     kernels::block::BlockSettings,
     layers::{Builder, Init, Linear, NormWeight, Source},
     ops::{self, Compute},
@@ -28,6 +28,7 @@ pub struct Dit {
     gaussians_per_token: usize,
     gradient_channels: bool,
     estimate_channels: bool,
+    observation_channels: bool,
     time_features: usize,
     #[module(skip)]
     preconditioning: Option<[f32; CHANNELS]>,
@@ -43,20 +44,22 @@ struct TimeMlp {
     second: Linear,
 }
 
-/// What the network is told of the Gaussians besides their noisy selves. Both `[b, n, 14]`; what is missing is zeros.
+/// What the network is told of the Gaussians besides their noisy selves. What is missing is zeros.
 #[derive(Clone, Debug, Default)]
 pub struct Feedback {
     /// The photometric gradient at the noisy Gaussians or at an estimate of the clean ones, each channel scaled to unit
-    /// RMS.
+    /// RMS. `[b, n, 14]`
     pub gradient: Option<Tensor<3>>,
-    /// An earlier estimate of the clean Gaussians, normalised.
+    /// An earlier estimate of the clean Gaussians, normalised. `[b, n, 14]`
     pub estimate: Option<Tensor<3>>,
+    /// What the input views show of that estimate. `[b, n, 9]`
+    pub observation: Option<Tensor<3>>,
 }
 
 /// A gradient alone, if any.
 impl From<Option<Tensor<3>>> for Feedback {
     fn from(gradient: Option<Tensor<3>>) -> Self {
-        Self { gradient, estimate: None }
+        Self { gradient, ..Self::default() }
     }
 }
 
@@ -259,6 +262,7 @@ impl Dit {
             gaussians_per_token: config.gaussians_per_token,
             gradient_channels: config.gradient_channels,
             estimate_channels: config.estimate_channels,
+            observation_channels: config.observation_channels,
             preconditioning: config.preconditioning,
             time_features: config.time_features,
             compute: Compute::F32,
@@ -296,6 +300,11 @@ impl Dit {
         self.estimate_channels
     }
 
+    /// Whether [`forward`](Self::forward) takes what the input views show of that estimate.
+    pub fn observation_channels(&self) -> bool {
+        self.observation_channels
+    }
+
     /// The conditioning vector of the time: `t` `[b]` in 0..1 to `[b, d]`.
     pub fn condition(&self, t: Tensor<1>) -> Tensor<2> {
         self.t_mlp.second.forward(silu(self.t_mlp.first.forward(time_embedding(t, self.time_features))))
@@ -308,14 +317,15 @@ impl Dit {
         assert_eq!(c, CHANNELS, "the noisy Gaussians have {CHANNELS} channels");
         assert!(n.is_multiple_of(p), "{n} Gaussians do not fill tokens of {p}");
         let kinds = [
-            ("gradient", self.gradient_channels, feedback.gradient),
-            ("estimate", self.estimate_channels, feedback.estimate),
+            ("gradient", self.gradient_channels, feedback.gradient, CHANNELS),
+            ("estimate", self.estimate_channels, feedback.estimate, CHANNELS),
+            ("observation", self.observation_channels, feedback.observation, OBSERVATION),
         ];
         let mut gaussians = vec![noisy.clone()];
-        for (name, wanted, given) in kinds {
+        for (name, wanted, given, width) in kinds {
             assert!(wanted || given.is_none(), "this model is configured without {name} channels");
             if wanted {
-                gaussians.push(given.unwrap_or_else(|| noisy.zeros_like()));
+                gaussians.push(given.unwrap_or_else(|| Tensor::zeros([b, n, width], &noisy.device())));
             }
         }
         let gaussians = Tensor::cat(gaussians, 2);

@@ -64,9 +64,22 @@ impl FreeRange {
     /// If the model is configured for another encoder.
     pub fn with_dinov2(mut self, config: &ModelConfig, dinov2: Dinov2) -> Result<Self, ModelError> {
         check_dinov2(config, &dinov2)?;
-        self.encoder.replace_dinov2(dinov2);
+        self.encoder.replace_dinov2(Some(dinov2));
         self.encoder.set_compute(self.dit.compute());
         Ok(self)
+    }
+
+    /// What is trained, and the frozen DINOv2 apart from it if there is one. Without it no image can be encoded until it is
+    /// [put back](Self::put_dinov2).
+    pub fn take_dinov2(mut self) -> (Self, Option<Dinov2>) {
+        let dinov2 = self.encoder.replace_dinov2(None);
+        (self, dinov2)
+    }
+
+    /// Undoes [`take_dinov2`](Self::take_dinov2).
+    pub fn put_dinov2(mut self, dinov2: Option<Dinov2>) -> Self {
+        self.encoder.replace_dinov2(dinov2);
+        self
     }
 
     /// The same model, computing this way: the transformer's blocks, and on a GPU a frozen DINOv2 too. Whether a
@@ -137,10 +150,10 @@ impl FreeRange {
 /// Refuses DINOv2 weights of another architecture than the configuration names.
 pub(crate) fn check_dinov2(config: &ModelConfig, dinov2: &Dinov2) -> Result<(), ModelError> {
     match &config.encoder {
-        EncoderConfig::Dinov2(c) if c == dinov2.config() => Ok(()),
+        EncoderConfig::Dinov2(c) if c.architecture() == *dinov2.config() => Ok(()),
         other => {
             let expected = format!("the architecture of the given weights, {:?}", dinov2.config());
-            Err(ModelError::config("encoder", expected, format!("{other:?}")))
+            Err(ModelError::config("encoder", expected, format!("{:?}", other.architecture())))
         }
     }
 }

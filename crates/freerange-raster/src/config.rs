@@ -18,7 +18,7 @@ impl Default for RasterConfig {
 }
 
 impl RasterConfig {
-    /// For images that stand for larger ones, `ratio` (0..1) being the small width over the large: the blur, a constant
+    /// For images that stand for larger ones, `ratio` (0..1) being the small longest side over the large: the blur, a constant
     /// number of pixels, shrinks with them. Else Gaussians that look right on small images are too thin on large ones.
     pub fn shrunk(self, ratio: f32) -> Self {
         Self { blur: self.blur * ratio.min(1.0).powi(2), ..self }

@@ -11,6 +11,7 @@ mod merge;
 mod normalize;
 pub mod patch;
 mod ply;
+mod ply_compressed;
 mod ply_header;
 mod tree;
 
@@ -20,5 +21,5 @@ pub use error::SplatError;
 pub use file::{sync_folder, sync_tree, write_atomically};
 pub use merge::{Gaussian, OPACITY_RANGE, merge};
 pub use normalize::{Normalization, STD_FLOOR, Statistics};
-pub use ply::{PlyFile, parse_ply, read_ply, write_ply};
+pub use ply::{PlyFile, encode_ply, parse_ply, read_ply, write_ply};
 pub use tree::{LodTree, Node};

@@ -2,10 +2,11 @@
 //!
 //! Written: binary little endian, `x y z nx ny nz f_dc_0..2 opacity scale_0..2 rot_0..3`, all float; `f_dc` is the
 //! colour as the constant term of spherical harmonics, `opacity` a logit, `scale` a logarithm, `rot` a quaternion wxyz.
-//! Read: any order of properties, further properties and elements, ascii and both byte orders. Headers are not trusted:
-//! memory grows with the rows that arrive.
+//! Read: any order of properties, further properties and elements, ascii and both byte orders, and the compressed form
+//! of PlayCanvas. Headers are not trusted: memory grows with the rows that arrive.
 
 use crate::cloud::Row;
+use crate::ply_compressed;
 use crate::ply_header::{Element, Format, Header, Kind, Property, Scalar, read_header};
 use crate::{Cloud, SplatError, channel, write_atomically};
 use std::io::{self, BufRead, BufReader, Read, Write};
@@ -53,8 +54,8 @@ pub struct PlyFile {
 /// Reads the Gaussians of a `.ply` file.
 ///
 /// # Errors
-/// [`SplatError::Io`]; [`SplatError::PlyHeader`], [`SplatError::PlyProperty`] and [`SplatError::PlyValue`] where the file
-/// is no `.ply`, does not hold Gaussians, ends early, or holds a value that is not finite.
+/// [`SplatError::Io`]; [`SplatError::PlyHeader`], [`SplatError::PlyProperty`] and [`SplatError::PlyValue`] where the
+/// file is no `.ply`, does not hold Gaussians, ends early, or holds a value that is not finite.
 pub fn read_ply(file: &Path) -> Result<PlyFile, SplatError> {
     let opened = File::open(file).map_err(|source| SplatError::Io { file: file.into(), source })?;
     parse_ply(BufReader::with_capacity(1 << 18, opened), file)
@@ -70,10 +71,13 @@ pub fn parse_ply(mut reader: impl BufRead, file: &Path) -> Result<PlyFile, Splat
         let names: Vec<_> = header.elements.iter().map(|e| e.name.as_str()).collect();
         return Err(property_error(file, "x", "an element \"vertex\"", &format!("the elements {}", listed(&names))));
     };
+    let mut values = Values { reader, format: header.format, file, line: Vec::new(), used: 0 };
+    if ply_compressed::is_compressed(&header.elements[at]) {
+        return ply_compressed::read(values, &header, at);
+    }
     let channel_of = columns(&header.elements[at], file)?;
     let mut notes = notes(&header, at);
 
-    let mut values = Values { reader, format: header.format, file, line: Vec::new(), used: 0 };
     for element in &header.elements[..at] {
         values.rows(element, |_, _, _| Ok(()))?;
     }
@@ -111,6 +115,17 @@ pub fn parse_ply(mut reader: impl BufRead, file: &Path) -> Result<PlyFile, Splat
 pub fn write_ply(cloud: &Cloud, file: &Path) -> Result<(), SplatError> {
     cloud.check_finite()?;
     write_atomically(file, |w| write_to(cloud, w)).map_err(|source| SplatError::Io { file: file.into(), source })
+}
+
+/// The bytes that [`write_ply`] writes.
+///
+/// # Errors
+/// [`SplatError::Value`] where a channel is not finite.
+pub fn encode_ply(cloud: &Cloud) -> Result<Vec<u8>, SplatError> {
+    cloud.check_finite()?;
+    let mut bytes = Vec::new();
+    write_to(cloud, &mut bytes).expect("memory can be written to");
+    Ok(bytes)
 }
 
 fn write_to(cloud: &Cloud, w: &mut impl Write) -> io::Result<()> {
@@ -175,10 +190,10 @@ fn listed(names: &[&str]) -> String {
 }
 
 /// The values after the header, row by row.
-struct Values<'a, R> {
+pub(crate) struct Values<'a, R> {
     reader: R,
     format: Format,
-    file: &'a Path,
+    pub(crate) file: &'a Path,
     /// ascii: the current line, and how much of it is used up.
     line: Vec<u8>,
     used: usize,
@@ -189,7 +204,7 @@ const LINE_LIMIT: u64 = 1 << 24;
 
 impl<R: BufRead> Values<'_, R> {
     /// Calls `each(row, column, value)` for all single values of `element`; of lists, for their length.
-    fn rows(
+    pub(crate) fn rows(
         &mut self,
         element: &Element,
         mut each: impl FnMut(u64, usize, f64) -> Result<(), SplatError>,
@@ -321,7 +336,7 @@ fn quoted(bytes: &[u8]) -> String {
     format!("{:?}", String::from_utf8_lossy(&bytes[..bytes.len().min(40)]))
 }
 
-fn property_error(file: &Path, property: &str, expected: &str, found: &str) -> SplatError {
+pub(crate) fn property_error(file: &Path, property: &str, expected: &str, found: &str) -> SplatError {
     SplatError::PlyProperty {
         file: file.into(),
         property: property.into(),
@@ -330,7 +345,14 @@ fn property_error(file: &Path, property: &str, expected: &str, found: &str) -> S
     }
 }
 
-fn value_error(file: &Path, element: &Element, row: u64, property: &str, expected: &str, found: &str) -> SplatError {
+pub(crate) fn value_error(
+    file: &Path,
+    element: &Element,
+    row: u64,
+    property: &str,
+    expected: &str,
+    found: &str,
+) -> SplatError {
     SplatError::PlyValue {
         file: file.into(),
         element: element.name.as_str().into(),

@@ -251,3 +251,67 @@ fn counts_are_not_believed() {
     let endless = [b"ply\ncomment ".as_slice(), &vec![b'x'; 1 << 20]].concat();
     assert!(refusal(&endless).contains("too long"));
 }
+
+/// A compressed file of so many chunks and Gaussians: all bounds are -1 and 3, all words are `word`.
+fn compressed(chunks: usize, gaussians: usize, word: u32) -> Vec<u8> {
+    let bounds = ["x", "y", "z", "scale_x", "scale_y", "scale_z"];
+    let columns = |side: &str, names: &[&str]| -> String {
+        names.iter().map(|name| format!("property float {side}_{name}\n")).collect()
+    };
+    let mut file = format!("ply\nformat binary_little_endian 1.0\nelement chunk {chunks}\n");
+    for names in [&bounds[..3], &bounds[3..]] {
+        file += &(columns("min", names) + &columns("max", names));
+    }
+    file += &format!("element vertex {gaussians}\n");
+    for name in ["position", "rotation", "scale", "color"] {
+        file += &format!("property uint packed_{name}\n");
+    }
+    let mut bytes = (file + "end_header\n").into_bytes();
+    for _ in 0..2 * chunks {
+        [-1f32, -1.0, -1.0, 3.0, 3.0, 3.0].iter().for_each(|v| bytes.extend(v.to_le_bytes()));
+    }
+    (0..4 * gaussians).for_each(|_| bytes.extend(word.to_le_bytes()));
+    bytes
+}
+
+#[test]
+fn compressed_files_are_unpacked_between_the_bounds_of_their_chunk() {
+    // All ones are the greatest value, of a rotation three components of half the root of 2: more than a unit
+    // quaternion has.
+    let row = *parse(&compressed(1, 3, u32::MAX)).unwrap().cloud.row(2);
+    assert_eq!(row[..6], [3.0; 6]);
+    assert!(row[6..9].iter().all(|v| (v - (1f32 / 3.0).sqrt()).abs() < 1e-6) && row[9] == 0.0, "{row:?}");
+    assert!(row[10] > 5.5 && row[11..] == [1.0; 3]);
+    let row = *parse(&compressed(1, 1, 0)).unwrap().cloud.row(0);
+    assert_eq!(row[..6], [-1.0; 6]);
+    assert!(row[10] < -5.5 && row[11..] == [0.0; 3]);
+    // Gaussian 256 is in the second chunk.
+    assert_eq!(parse(&compressed(2, 257, 0)).unwrap().cloud.len(), 257);
+}
+
+#[test]
+fn broken_compressed_files_are_refused() {
+    let refused = |bytes: &[u8], words: &[&str]| {
+        let message = parse(bytes).unwrap_err().to_string();
+        words.iter().for_each(|w| assert!(message.contains(w), "{w:?} in {message}"));
+    };
+    let edited = |from: &str, to: &str| {
+        let mut bytes = compressed(1, 2, 7);
+        let at = bytes.windows(from.len()).position(|w| w == from.as_bytes()).unwrap();
+        bytes.splice(at..at + from.len(), to.bytes());
+        bytes
+    };
+    refused(&compressed(1, 257, 0), &["row 256", "packed_position", "a chunk for every Gaussian", "1 chunks"]);
+    refused(&edited("element chunk", "element other"), &["\"chunk\" before", "none"]);
+    refused(&edited("float min_x", "float mix_x"), &["min_x", "no such property"]);
+    refused(&edited("float max_scale_y", "int max_scale_y"), &["max_scale_y", "float or double", "int"]);
+    refused(&edited("uint packed_color", "int packed_color"), &["packed_color", "expected uint", "int"]);
+    refused(
+        &edited("element vertex 2", "element vertex 9000000000"),
+        &["row 2", "9000000000 rows", "the end of the file"],
+    );
+    let mut infinite = compressed(1, 2, 7);
+    let at = infinite.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
+    infinite[at + 4..at + 8].copy_from_slice(&f32::INFINITY.to_le_bytes());
+    refused(&infinite, &["element \"chunk\"", "row 0", "min_y", "a finite number", "inf"]);
+}

@@ -1,9 +1,8 @@
 //! `freerange devices`
 
-use crate::{
-    device::{Api, all},
-    error::CliError,
-};
+use freerange::Api;
+
+use crate::error::CliError;
 
 /// List the devices that this program can compute on, the best first.
 #[derive(clap::Args)]
@@ -15,7 +14,7 @@ pub struct Args {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
-    let devices = all();
+    let devices = freerange::devices();
     if args.json {
         println!("{}", serde_json::to_string_pretty(&devices).map_err(CliError::input)?);
         return Ok(());

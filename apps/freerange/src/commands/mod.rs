@@ -1,9 +1,12 @@
 //! One file per command: its arguments, and what it prints and writes.
 
 pub mod bench;
+pub mod convert;
 pub mod data;
 pub mod devices;
 pub mod eval;
+pub mod export;
+pub mod inspect;
 pub mod model;
 pub mod reconstruct;
 pub mod render;

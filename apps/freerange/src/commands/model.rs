@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use freerange::{EncoderPlaces, checkpoint_header, load_checkpoint};
 use freerange_flow::config::TrainConfig;
 use freerange_model::{Compute, Execution, ModelConfig, ModelInfo, Workload};
 
@@ -14,6 +15,8 @@ pub enum Command {
     Info(Info),
     /// Write a checkpoint with weights of 16 bits: half the size, the same results to three digits.
     Shrink(Shrink),
+    /// Write a folder in the layout of model hubs: weights, configuration and a card.
+    Export(super::export::Args),
 }
 
 /// Arguments of `model info`.
@@ -21,6 +24,9 @@ pub enum Command {
 pub struct Info {
     /// Training configuration (.toml) or checkpoint (.safetensors) [default: the shipped checkpoint].
     file: Option<PathBuf>,
+    /// Folder of the weights of the checkpoint's frozen encoder: see `freerange reconstruct`.
+    #[arg(long, value_name = "FOLDER")]
+    encoder_weights: Option<PathBuf>,
     /// Samples at once [default: the last stage's batch, or 1].
     #[arg(long)]
     batch: Option<usize>,
@@ -42,6 +48,9 @@ pub struct Shrink {
     input: PathBuf,
     /// Checkpoint to write.
     output: PathBuf,
+    /// Folder of the weights of the checkpoint's frozen encoder: see `freerange reconstruct`.
+    #[arg(long, value_name = "FOLDER")]
+    encoder_weights: Option<PathBuf>,
     /// Sample by default as this configuration's table `sample` says (a file, or tiny, base or paper), not as the one
     /// that the model was trained with.
     #[arg(long, value_name = "CONFIG")]
@@ -52,8 +61,11 @@ pub struct Shrink {
 pub fn run(command: &Command) -> Result<(), CliError> {
     match command {
         Command::Info(args) => info(args),
+        Command::Export(args) => super::export::run(args),
         Command::Shrink(args) => {
-            let mut checkpoint = runtime::checkpoint(Some(&args.input), &burn::tensor::Device::flex())?;
+            let encoders = EncoderPlaces::at(args.encoder_weights.clone());
+            let mut checkpoint =
+                load_checkpoint(Some(&runtime::local(&args.input)?), &encoders, &burn::tensor::Device::flex())?;
             if let Some(path) = &args.sampling {
                 let sample = serde_json::to_value(TrainConfig::load(path)?.sample).map_err(CliError::input)?;
                 let Some(provenance) = checkpoint.provenance.as_object_mut() else {
@@ -75,11 +87,11 @@ fn info(args: &Info) -> Result<(), CliError> {
             let config = TrainConfig::load(file)?;
             let stage = config.stages.last().ok_or_else(|| CliError::input("a configuration without stages"))?.clone();
             let model = ModelConfig { image_size: stage.image_size, ..config.model };
-            (model, stage.depth, stage.batch, config.optimizer.compute, config.optimizer.recompute, None)
+            (model, stage.depth, stage.at_a_time(), config.optimizer.compute, config.optimizer.recompute, None)
         }
         (file, _) => {
-            let c = runtime::checkpoint(file.as_deref(), &burn::tensor::Device::flex())?;
-            (c.config, c.depth, 1, Compute::F32, false, Some(c.provenance))
+            let c = checkpoint_header(runtime::local_or_shipped(file.as_deref())?.as_deref())?;
+            (c.config, c.depth, 1, Compute::F32, false, Some((c.provenance, c.encoder_weights)))
         }
     };
     let workload = Workload { batch: args.batch.unwrap_or(batch), views: args.views, gaussians: 1 << depth };
@@ -90,7 +102,14 @@ fn info(args: &Info) -> Result<(), CliError> {
         return Ok(());
     }
     println!("{info}");
-    if let Some(provenance) = provenance {
+    if let Some((provenance, encoder)) = provenance {
+        if let Some(origin) = encoder {
+            println!("\nencoder weights {} (sha256 {})", origin.name, origin.sha256);
+            match EncoderPlaces::at(args.encoder_weights.clone()).find(&origin.name) {
+                Ok(found) => println!("found in {}", found.folder.display()),
+                Err(e) => println!("not found: {e}"),
+            }
+        }
         println!("\n{}", serde_json::to_string_pretty(&provenance).map_err(CliError::input)?);
     }
     Ok(())

@@ -1,33 +1,33 @@
 //! `freerange reconstruct`
 
-use std::{path::PathBuf, time::Instant};
+use std::{ops::ControlFlow, path::PathBuf, time::Instant};
 
-use burn::tensor::Device;
-use freerange_camera::{
-    Scene, Up, View,
-    image_ops::{sheet, to_picture},
+use freerange::{
+    Compute, Device, DeviceName, EncoderPlaces, Options, Reconstructor, SampleConfig, Scores, Solver, Stage, View,
+    pictures::{on_white, render_view, write_turntable},
+    score, write_ply,
 };
-use freerange_flow::sample::{SampleConfig, Solver};
-use freerange_model::Compute;
-use freerange_splat::write_ply;
+use freerange_camera::image_ops::{sheet, to_picture};
+use freerange_eval::memory::peak_memory;
+use freerange_formats::{Format, Frame, WriteOptions};
 use serde::Serialize;
 
 use crate::{
-    device::{DeviceName, parse_compute, require},
     error::CliError,
     output::OutputFolder,
-    pictures::{on_white, render_view, write_turntable},
-    pipeline::{self, Options, Scores, score, to_user},
-    runtime::{checkpoint, peak_memory},
+    photos::{Photos, UpChoice},
+    progress::Progress,
+    runtime::local,
 };
 
 /// Reconstruct an object from posed images.
 ///
-/// Writes gaussians.ply (in the frame of your cameras), turntable.gif, inputs/ (each input view beside its render)
-/// and report.json.
+/// Writes gaussians.ply (in the frame of your cameras; --format for others), turntable.gif, inputs/ (each input view
+/// beside its render) and report.json.
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folder with transforms.json (or transforms_train.json and transforms_test.json), or such a file.
+    /// Folder of photos with cameras: transforms.json (or transforms_train.json and transforms_test.json), a COLMAP model, Polycam's
+    /// keyframes, a Metashape .xml or a RealityCapture .csv; or such a file.
     scene: PathBuf,
     /// Where the results go.
     #[arg(short, long, default_value = "out")]
@@ -35,11 +35,20 @@ pub struct Args {
     /// Another scene of the same object whose views are only compared with.
     #[arg(long, value_name = "SCENE")]
     validate: Option<PathBuf>,
+    /// Views that the model is shown, from all around the object, if there are more [default: as many as it has seen at
+    /// once in training, six for the shipped one]. Refinement looks at all.
+    #[arg(long, value_name = "K", value_parser = clap::value_parser!(u16).range(1..=256))]
+    views: Option<u16>,
+    #[command(flatten)]
+    photos: Photos,
     #[command(flatten)]
     sampling: Sampling,
     /// Samples to draw; they differ where the images leave the object open.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
     samples: u32,
+    /// Also write the Gaussians in these formats: splat, spz, sog, glb, html (a page that shows them).
+    #[arg(long, value_name = "FORMATS", value_delimiter = ',')]
+    format: Vec<Format>,
     /// Print the report as JSON on standard output.
     #[arg(long)]
     json: bool,
@@ -48,13 +57,18 @@ pub struct Args {
 /// Options of every command that samples.
 #[derive(clap::Args)]
 pub struct Sampling {
-    /// Model to use instead of the shipped one.
+    /// Model to use instead of the shipped one: a file, or hf:owner/name[@revision] for one on the Hugging Face hub.
+    /// What a revision meant when it was first used is kept in the cache.
     #[arg(long, value_name = "FILE")]
     pub checkpoint: Option<PathBuf>,
+    /// Folder of the weights (config.json, model.safetensors) of the checkpoint's frozen encoder, if it has one [default:
+    /// where it was when the model was trained, or where `freerange weights fetch` puts it].
+    #[arg(long, value_name = "FOLDER", requires = "checkpoint")]
+    pub encoder_weights: Option<PathBuf>,
     /// Continue from the sample with so many steps of 3DGS-MCMC on the input views, up to 4,096 Gaussians and held in
-    /// place where no view looks; 500 are enough.
-    #[arg(long, default_value_t = 0, value_name = "STEPS")]
-    pub refine: usize,
+    /// place where no view looks; 500 are enough, 0 is none [default: the checkpoint's].
+    #[arg(long, value_name = "STEPS")]
+    pub refine: Option<usize>,
     /// Seed of the (first) sample.
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
@@ -73,15 +87,17 @@ pub struct Sampling {
     /// Photometric guidance scale lambda; 0 is none [default: the checkpoint's].
     #[arg(long)]
     pub photometric: Option<f32>,
-    /// How the steps are taken: euler, heun (two evaluations per step) or multistep [default: the checkpoint's].
+    /// How the steps are taken: euler, heun (two evaluations per step), multistep, or hold (only estimates are fed back)
+    /// [default: the checkpoint's].
     #[arg(long, value_parser = parse_solver)]
     pub solver: Option<Solver>,
     /// Arithmetic of the transformer: f32, or bf16 or f16 where the device has it [default: the checkpoint's].
     #[arg(long, value_parser = parse_compute)]
     pub compute: Option<Compute>,
-    /// Which way is up in the scene's frame.
-    #[arg(long, value_enum, default_value = "z")]
-    pub up: UpName,
+    /// Which way is up in the scene's frame: z, y, cameras (where the tops of the photos point), a direction X,Y,Z, or auto:
+    /// z where the cameras' format has it so, else from what the object stands on, or the cameras.
+    #[arg(long, default_value = "auto", allow_hyphen_values = true)]
+    pub up: UpChoice,
     /// Where to compute: auto, cpu, or cuda, metal, vulkan, webgpu with a number if there are several, as in cuda:1.
     #[arg(long, default_value = "auto")]
     pub device: DeviceName,
@@ -96,65 +112,79 @@ pub enum StartName {
     Noise,
 }
 
-/// Which way is up.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-pub enum UpName {
-    /// The z axis (Blender, NeRF, nerfstudio).
-    Z,
-    /// The y axis.
-    Y,
-    /// Where the tops of the images point, on average.
-    Cameras,
+/// A solver by its name.
+fn parse_solver(text: &str) -> Result<Solver, String> {
+    serde_json::from_value(text.into()).map_err(|_| "expected euler, heun, multistep or hold".into())
 }
 
-/// `euler`, `heun` or `multistep`.
-fn parse_solver(text: &str) -> Result<Solver, String> {
-    serde_json::from_value(text.into()).map_err(|_| "expected euler, heun or multistep".into())
+/// `f32`, `bf16` or `f16`.
+pub fn parse_compute(text: &str) -> Result<Compute, String> {
+    serde_json::from_value(text.into()).map_err(|_| "expected f32, bf16 or f16".into())
 }
 
 impl Sampling {
-    /// Which way is up, as the camera crate calls it.
-    pub fn up(&self) -> Up {
-        match self.up {
-            UpName::Z => Up::Z,
-            UpName::Y => Up::Y,
-            UpName::Cameras => Up::Cameras,
-        }
+    /// The model that the user names, or the shipped one.
+    pub fn open(&self, device: &Device) -> Result<Reconstructor, CliError> {
+        Ok(match &self.checkpoint {
+            Some(path) => Reconstructor::load(&local(path)?, &EncoderPlaces::at(self.encoder_weights.clone()), device)?,
+            None => Reconstructor::shipped(device)?,
+        })
     }
 
-    /// The checkpoint's own way to sample, with what the user overrides.
-    pub fn options(
-        &self,
-        checkpoint: &freerange_model::Checkpoint,
-        samples: u32,
-        device: &Device,
-    ) -> Result<Options, CliError> {
-        let mut sample: SampleConfig = match checkpoint.provenance.get("sample") {
-            Some(value) => serde_json::from_value(value.clone())
-                .map_err(|e| CliError::input(format!("checkpoint: field `sample` of the metadata: {e}")))?,
-            None => SampleConfig::default(),
-        };
+    /// The model's own way to sample, with what the user overrides.
+    pub fn options(&self, model: &Reconstructor, samples: u32) -> Result<Options, CliError> {
+        let mut options = model.options()?;
+        if self.start == Some(StartName::Noise) {
+            options.sample = options.sample.without_start();
+        }
+        let sample = &mut options.sample;
         sample.steps = self.steps.unwrap_or(sample.steps);
         sample.depth = self.depth.or(sample.depth);
         sample.start = match self.start {
             Some(StartName::Noise) => None,
-            Some(StartName::Fit) => Some(sample.start.unwrap_or_default()),
-            None => sample.start,
+            Some(StartName::Fit) => Some(sample.start.take().unwrap_or_default()),
+            None => sample.start.take(),
         };
         sample.guidance = self.guidance.unwrap_or(sample.guidance);
         sample.photometric = self.photometric.unwrap_or(sample.photometric);
         sample.solver = self.solver.unwrap_or(sample.solver);
         sample.compute = self.compute.unwrap_or(sample.compute);
-        sample.validate()?;
-        require(sample.compute, device)?;
-        Ok(Options {
-            sample,
-            seeds: (0..u64::from(samples)).map(|i| self.seed.wrapping_add(i)).collect(),
-            without_network: false,
-            refine: self.refine,
-            up: self.up(),
-            quiet: false,
-        })
+        sample.refine = self.refine.unwrap_or(sample.refine);
+        options.seeds = (0..u64::from(samples)).map(|i| self.seed.wrapping_add(i)).collect();
+        options.frame.up = self.up.or_z();
+        model.check(&options)?;
+        Ok(options)
+    }
+}
+
+/// Shows on the screen how far a reconstruction has come.
+#[derive(Default)]
+struct Watch {
+    bar: Option<((Stage, usize), Progress)>,
+}
+
+impl Watch {
+    fn at(&mut self, told: &freerange::Progress<'_>) {
+        let label = match told.stage {
+            Stage::Fit => "fitting",
+            Stage::Sample => "sampling",
+            Stage::Refine => "refining",
+            _ => return,
+        };
+        let task = (told.stage, told.sample);
+        if self.bar.as_ref().is_none_or(|(at, _)| *at != task) {
+            self.finish();
+            self.bar = Some((task, Progress::new(label, told.total as u64)));
+        }
+        if let Some((_, bar)) = &mut self.bar {
+            bar.at(told.done as u64, &told.loss.map_or(String::new(), |loss| format!("loss {loss:.4}")));
+        }
+    }
+
+    fn finish(&mut self) {
+        if let Some((_, bar)) = self.bar.take() {
+            bar.finish();
+        }
     }
 }
 
@@ -163,9 +193,11 @@ struct Report {
     scene: PathBuf,
     notes: Vec<String>,
     sampling: SampleConfig,
+    /// Names of the views that the model was shown.
+    views_shown: Vec<String>,
     gaussians: usize,
     /// Scale, rotation (x y z w) and translation from the scene's frame to the model's.
-    canonical_from_user: freerange_camera::Similarity,
+    canonical_from_user: freerange::Similarity,
     samples: Vec<SampleReport>,
     seconds: Vec<(&'static str, f64)>,
     peak_memory_bytes: Option<u64>,
@@ -192,57 +224,70 @@ struct Before {
 pub fn run(args: &Args) -> Result<(), CliError> {
     let begin = Instant::now();
     let device = args.sampling.device.open()?;
-    let scene = Scene::load(&args.scene)?;
-    let mut further = scene.further;
+    let scene = args.photos.load(&args.scene, args.sampling.up)?;
+    let inputs = scene.loaded.views;
+    let mut further = scene.loaded.further;
     if let Some(path) = &args.validate {
-        let other = Scene::load(path)?;
-        further.extend(other.inputs);
-        further.extend(other.further);
+        further.extend(Photos::further(path)?);
     }
-    let checkpoint = checkpoint(args.sampling.checkpoint.as_deref(), &device)?;
-    let options = args.sampling.options(&checkpoint, args.samples, &device)?;
+    let model = args.sampling.open(&device)?;
+    let mut options = args.sampling.options(&model, args.samples)?;
+    options.views = args.views.map(usize::from);
+    options.frame = scene.frame;
     let output = OutputFolder::create("reconstruct", &args.output)?;
     let mut seconds = vec![("load", begin.elapsed().as_secs_f64())];
 
-    let result = pipeline::run(&scene.inputs, &checkpoint, &options, &device)?;
-    seconds.extend(&result.seconds);
+    let mut watch = Watch::default();
+    let result = model.run(&inputs, &options, &mut |told| {
+        watch.at(told);
+        ControlFlow::Continue(())
+    })?;
+    watch.finish();
+    seconds.extend(result.seconds.iter().map(|(stage, seconds)| (stage.name(), *seconds)));
 
     let begin = Instant::now();
+    // The canonical frame has +z up.
+    let up = result.canonical_from_user.rotation.inverse() * glam::DVec3::Z;
+    let frame = Frame::with_up(up).unwrap_or_default();
+    let mut notes = scene.notes;
     let mut samples = Vec::new();
     for (i, sample) in result.samples.iter().enumerate() {
         let suffix = if i == 0 { String::new() } else { format!("-{i}") };
         let file = format!("gaussians{suffix}.ply");
-        let user = to_user(&sample.refined, &result.frame.canonical_from_user);
-        write_ply(&user, &output.path(&file)?)?;
-        write_turntable(&output.path(&format!("turntable{suffix}.gif"))?, &sample.refined, 48, 256)?;
-        for (view, picture) in comparisons(&user, &scene.inputs)? {
+        write_ply(&sample.gaussians, &output.path(&file)?)?;
+        for format in args.format.iter().filter(|f| **f != Format::Ply) {
+            let name = if *format == Format::Html { "view" } else { "gaussians" };
+            let options = WriteOptions { frame, ..WriteOptions::default() };
+            let path = output.path(&format!("{name}{suffix}.{format}"))?;
+            let lost = freerange_formats::write(&sample.gaussians, &path, &options)?;
+            notes.extend(lost.into_iter().map(|note| format!("{name}{suffix}.{format}: {note}")));
+        }
+        write_turntable(&output.path(&format!("turntable{suffix}.gif"))?, &sample.canonical, 48, 256)?;
+        for (view, picture) in comparisons(&sample.gaussians, &inputs)? {
             output.picture(&format!("inputs{suffix}/{view}.png"), &picture)?;
         }
-        let before_refinement = match options.refine {
-            0 => None,
-            _ => {
-                let plain = to_user(&sample.plain, &result.frame.canonical_from_user);
-                Some(Before { input_views: score(&plain, &scene.inputs)?, further_views: score(&plain, &further)? })
-            }
+        let before_refinement = match &sample.unrefined {
+            None => None,
+            Some(plain) => Some(Before { input_views: score(plain, &inputs)?, further_views: score(plain, &further)? }),
         };
         samples.push(SampleReport {
             seed: sample.seed,
             file,
-            input_views: score(&user, &scene.inputs)?,
-            further_views: score(&user, &further)?,
+            input_views: score(&sample.gaussians, &inputs)?,
+            further_views: score(&sample.gaussians, &further)?,
             before_refinement,
         });
     }
     seconds.push(("write", begin.elapsed().as_secs_f64()));
 
-    let mut notes = scene.notes;
-    notes.extend(result.frame.notes.clone());
+    notes.extend(result.notes);
     let report = Report {
         scene: args.scene.clone(),
         notes,
         sampling: options.sample,
-        gaussians: result.samples.first().map_or(0, |s| s.refined.len()),
-        canonical_from_user: result.frame.canonical_from_user,
+        views_shown: result.shown.iter().map(|&i| inputs[i].name.clone()).collect(),
+        gaussians: result.samples.first().map_or(0, |s| s.gaussians.len()),
+        canonical_from_user: result.canonical_from_user,
         samples,
         seconds,
         peak_memory_bytes: peak_memory(),
@@ -258,7 +303,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
 }
 
 /// Each input image beside its render.
-fn comparisons(cloud: &freerange_splat::Cloud, views: &[View]) -> Result<Vec<(String, image::RgbaImage)>, CliError> {
+fn comparisons(cloud: &freerange::Cloud, views: &[View]) -> Result<Vec<(String, image::RgbaImage)>, CliError> {
     views
         .iter()
         .map(|view| {

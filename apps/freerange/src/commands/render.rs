@@ -2,19 +2,23 @@
 
 use std::path::PathBuf;
 
+use freerange::pictures::render_view;
 use freerange_camera::{image_ops::to_picture, load_cameras};
-use freerange_splat::{PlyFile, read_ply};
+use freerange_formats::{Frame, Loaded, read};
 
-use crate::{error::CliError, output::OutputFolder, pictures::render_view, progress::Progress};
+use crate::{error::CliError, output::OutputFolder, progress::Progress};
 
-/// Render a .ply of Gaussians from given cameras: one PNG per frame, on white.
+/// Render Gaussians from given cameras: one PNG per frame, on white.
 #[derive(clap::Args)]
 pub struct Args {
-    /// Gaussians as the 3DGS programs write them.
+    /// Gaussians: .ply, .splat, .spz, .sog, .glb, or .html that this program wrote.
     file: PathBuf,
     /// transforms.json, or the folder that holds it; images are not needed where it says `w` and `h`.
     #[arg(long, value_name = "TRANSFORMS.json")]
     cameras: PathBuf,
+    /// Frame of the cameras: .glb and .spz, which have +y up, are turned into it; z-up, y-up or y-down.
+    #[arg(long, default_value = "z-up")]
+    frame: Frame,
     /// Where the pictures go.
     #[arg(short, long, default_value = "renders")]
     output: PathBuf,
@@ -22,7 +26,7 @@ pub struct Args {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
-    let PlyFile { cloud, notes } = read_ply(&args.file)?;
+    let Loaded { cloud, notes } = read(&args.file, args.frame)?;
     for note in notes {
         eprintln!("note: {note}");
     }

@@ -2,32 +2,41 @@
 
 use std::{path::PathBuf, time::Instant};
 
+use burn::tensor::Device;
+use freerange::{DeviceName, EncoderPlaces, load_checkpoint, require};
 use freerange_flow::{
+    batch::step_rng,
     config::TrainConfig,
     log::Log,
-    trainer::{Initial, Report, Trainer},
+    trainer::{Initial, Report, Trainer, Validated},
 };
 
-use crate::{
-    device::{DeviceName, require},
-    error::CliError,
-    progress::Progress,
-    runtime::checkpoint,
-};
+use freerange_model::{Execution, FreeRange, ModelConfig, ModelInfo, Workload};
+
+use crate::{error::CliError, progress::Progress, runtime::local_or_shipped};
 
 /// Train a model. Run the same command again to go on where it was stopped.
 ///
-/// Writes checkpoint.safetensors (averaged weights), log.jsonl (one line per step) and the state to go on from.
+/// Writes checkpoint.safetensors (averaged weights), log.jsonl (one line per step) and the state to go on from; with
+/// `[validation]` in the configuration also best.safetensors, the weights that measured best on other objects.
 #[derive(clap::Args)]
 pub struct Args {
     /// Configuration: a file such as configs/tiny.toml, or tiny, base or paper.
     config: PathBuf,
     /// Folder of the run.
-    #[arg(short, long)]
-    output: PathBuf,
+    #[arg(short, long, required_unless_present = "dry_run")]
+    output: Option<PathBuf>,
+    /// Build the whole model with random weights, say what a step of each stage needs, and end: neither data nor encoder
+    /// weights are looked for.
+    #[arg(long)]
+    dry_run: bool,
     /// Checkpoint whose weights a new run starts from.
     #[arg(long, value_name = "FILE")]
     initial: Option<PathBuf>,
+    /// Folder of the weights (config.json, model.safetensors) of the frozen encoder [default: what `weights` in the
+    /// configuration's [model.encoder] names].
+    #[arg(long, value_name = "FOLDER")]
+    encoder_weights: Option<PathBuf>,
     /// With --initial: normalise by the statistics of this run's data instead of the checkpoint's, for data made otherwise.
     #[arg(long, requires = "initial")]
     remeasure: bool,
@@ -48,11 +57,18 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     let device = args.device.open()?;
     let config = TrainConfig::load(&args.config)?;
     require(config.optimizer.compute, &device)?;
+    let output = match &args.output {
+        Some(output) if !args.dry_run => output,
+        _ => return dry_run(&config, &device),
+    };
     let total = config.total_steps();
-    let initial = args.initial.as_deref().map(|path| checkpoint(Some(path), &device)).transpose()?;
+    let encoders = EncoderPlaces::at(args.encoder_weights.clone());
+    let encoder = encoders.for_training(&config.model.encoder)?;
+    let initial = local_or_shipped(args.initial.as_deref())?;
+    let initial = initial.map(|path| load_checkpoint(Some(&path), &encoders, &device)).transpose()?;
     let initial = initial.as_ref().map(|checkpoint| Initial { checkpoint, remeasure: args.remeasure });
-    let mut trainer = Trainer::open(config, &args.output, initial, &device, |m| eprintln!("{m}"))?;
-    let mut log = Log::open(&args.output.join("log.jsonl"), trainer.step_count())?;
+    let mut trainer = Trainer::open_with(config, output, initial, encoder.as_ref(), &device, |m| eprintln!("{m}"))?;
+    let mut log = Log::open(&output.join("log.jsonl"), trainer.step_count())?;
     let mut bar = Progress::new("training", total);
     while trainer.step_count() < total {
         let report = match trainer.step() {
@@ -69,6 +85,14 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         };
         log.add(&report)?;
         bar.at(report.step, &line(&report));
+        if let Some(validated) = trainer.validate()? {
+            log.add(&validated)?;
+            let Validated { step, validation: v, best, .. } = validated;
+            eprintln!(
+                "validation after {step} steps: flow {:.3} held {:.4} PSNR {:.2} dB of {} samples (best {:.2} dB after {} steps)",
+                v.flow, v.held, v.psnr, v.samples, best.psnr, best.step
+            );
+        }
         let out_of_time = args.minutes.is_some_and(|m| begin.elapsed().as_secs_f64() > 60.0 * m);
         if report.step % args.save_every == 0 || report.step == total || out_of_time {
             log.sync()?;
@@ -79,7 +103,39 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         }
     }
     bar.finish();
-    println!("{} of {total} steps; {}", trainer.step_count(), args.output.join("checkpoint.safetensors").display());
+    println!("{} of {total} steps; {}", trainer.step_count(), output.join("checkpoint.safetensors").display());
+    Ok(())
+}
+
+/// Builds the model, and tells what its training needs.
+fn dry_run(config: &TrainConfig, device: &Device) -> Result<(), CliError> {
+    let built = FreeRange::new(&config.model, &mut step_rng(config.seed, 0), device)?;
+    let trained = built.parameters();
+    println!(
+        "built with random weights: {} tensors, {} numbers that are trained",
+        trained.len(),
+        trained.iter().map(|p| p.values.len()).sum::<usize>()
+    );
+    let views = config.loss.input_views.1;
+    for (number, stage) in config.stages.iter().enumerate() {
+        let model = ModelConfig { image_size: stage.image_size, ..config.model.clone() };
+        let workload = Workload { batch: stage.at_a_time(), views, gaussians: 1 << stage.depth };
+        let o = &config.optimizer;
+        let execution = Execution { gpu: *device != Device::flex(), compute: o.compute, recompute: o.recompute };
+        let size = |own: Option<u32>, all: u32| own.unwrap_or(all);
+        println!(
+            "\nstage {} of {}: {} steps of {} objects, {} at a time; images of {} px, rendering losses {} px, gradient {} px",
+            number + 1,
+            config.stages.len(),
+            stage.steps,
+            stage.batch,
+            stage.at_a_time(),
+            stage.image_size,
+            size(stage.render_size, config.loss.render_size),
+            size(stage.gradient_size, config.loss.gradient_size),
+        );
+        println!("{}", ModelInfo::with_execution(&model, workload, execution));
+    }
     Ok(())
 }
 

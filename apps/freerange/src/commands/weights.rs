@@ -47,7 +47,7 @@ struct Place {
 impl Place {
     #[cfg(feature = "networks")]
     fn folder(&self) -> Result<PathBuf, CliError> {
-        let known = self.weights.clone().or_else(crate::runtime::weights_folder);
+        let known = self.weights.clone().or_else(freerange::machine::weights_folder);
         known.ok_or_else(|| CliError::input("no cache folder is known on this system: expected --weights DIR"))
     }
 }

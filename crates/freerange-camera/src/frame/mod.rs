@@ -18,7 +18,7 @@ pub const CANONICAL_RADIUS: f64 = 0.5;
 const CANONICAL_DISTANCE: f64 = 1.75;
 
 /// Which direction of the user's frame is up.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Up {
     /// +z, as in NeRF's data sets, Blender and nerfstudio.
@@ -28,21 +28,27 @@ pub enum Up {
     Y,
     /// The mean of the cameras' own up directions.
     Cameras,
+    /// This one; not zero.
+    Direction(DVec3),
 }
 
 /// How the canonical frame is found.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default)]
 pub struct FrameConfig {
     /// Which direction is up.
     pub up: Up,
+    /// The object's middle in the user's frame, where it is known.
+    pub center: Option<DVec3>,
+    /// The radius of a sphere about its middle that holds the object, where it is known; in the user's lengths.
+    pub radius: Option<f64>,
     /// Leave place and scale as they are where the scene already looks canonical.
     pub keep_canonical: bool,
 }
 
 impl Default for FrameConfig {
     fn default() -> Self {
-        Self { up: Up::Z, keep_canonical: true }
+        Self { up: Up::Z, center: None, radius: None, keep_canonical: true }
     }
 }
 
@@ -74,21 +80,41 @@ pub fn canonical_from_user(views: &[View], config: &FrameConfig) -> Result<Canon
     if cropped > 0 {
         notes.push(format!("the object reaches the image border in {cropped} of {} views", views.len()));
     }
-    if config.keep_canonical && is_canonical(views, &silhouettes) {
+    for (name, bad) in [
+        ("center", config.center.is_some_and(|c| !c.is_finite())),
+        ("radius", config.radius.is_some_and(|r| !(r > 0.0 && r.is_finite()))),
+    ] {
+        if bad {
+            return Err(CameraError::Frame(format!(
+                "{name}: expected finite numbers and a radius above 0, found {config:?}"
+            )));
+        }
+    }
+    let told = config.center.is_some() || config.radius.is_some();
+    if config.keep_canonical && !told && is_canonical(views, &silhouettes) {
         notes.push("the scene already is in the canonical frame: place and scale are kept".into());
         let canonical_from_user = Similarity { rotation, ..Similarity::IDENTITY };
         return Ok(CanonicalFrame { canonical_from_user, kept: true, notes });
     }
 
     let axes: Vec<(DVec3, DVec3)> = views.iter().map(optical_axis).collect();
-    let (centre, radius) = if silhouettes.len() >= 2 {
-        let lines: Vec<(DVec3, DVec3)> = silhouettes.iter().map(|s| (s.origin, s.towards)).collect();
-        from_silhouettes(&silhouettes, nearest_point(&lines)?)?
-    } else {
-        let centre = nearest_point(&axes)?;
-        let mean = axes.iter().map(|(o, _)| o.distance(centre)).sum::<f64>() / axes.len() as f64;
-        notes.push("no masks: the object's size is taken from the cameras' distance".into());
-        (centre, mean * CANONICAL_RADIUS / CANONICAL_DISTANCE)
+    let masked = silhouettes.len() >= 2;
+    let (centre, radius) = match (config.center, config.radius) {
+        (Some(centre), Some(radius)) => (centre, radius),
+        (Some(centre), None) if masked => (centre, silhouettes.iter().map(|s| s.radius(centre)).fold(0.0, f64::max)),
+        (None, radius) if masked => {
+            let lines: Vec<(DVec3, DVec3)> = silhouettes.iter().map(|s| (s.origin, s.towards)).collect();
+            let (centre, found) = from_silhouettes(&silhouettes, nearest_point(&lines)?)?;
+            (centre, radius.unwrap_or(found))
+        }
+        (centre, radius) => {
+            let centre = centre.map_or_else(|| nearest_point(&axes), Ok)?;
+            let mean = axes.iter().map(|(o, _)| o.distance(centre)).sum::<f64>() / axes.len() as f64;
+            if radius.is_none() {
+                notes.push("no masks: the object's size is taken from the cameras' distance".into());
+            }
+            (centre, radius.unwrap_or(mean * CANONICAL_RADIUS / CANONICAL_DISTANCE))
+        }
     };
     let scale = CANONICAL_RADIUS / radius;
     let translation = -scale * (rotation * centre);
@@ -127,6 +153,10 @@ fn upright(views: &[View], up: Up) -> Result<DQuat, CameraError> {
             }
             mean.normalize()
         }
+        Up::Direction(up) => match up.try_normalize() {
+            Some(up) => up,
+            None => return Err(CameraError::Frame(format!("up: expected a direction, found {up}"))),
+        },
     };
     Ok(DQuat::from_rotation_arc(up, DVec3::Z))
 }

@@ -4,7 +4,7 @@ use super::{
     cut_out,
     json::{Description, FrameDescription, LARGEST_SIDE},
 };
-use crate::{CameraError, View};
+use crate::{CameraError, Lens, View};
 use image::{DynamicImage, ImageDecoder, ImageReader, RgbaImage};
 use std::{
     ffi::OsString,
@@ -27,7 +27,7 @@ pub(super) fn name_of(path: &Path) -> String {
 }
 
 /// The image file of a frame: as written, or with an extension added.
-fn find(frame: &FrameDescription) -> Result<PathBuf, CameraError> {
+pub fn find(frame: &FrameDescription) -> Result<PathBuf, CameraError> {
     if frame.image.is_file() {
         return Ok(frame.image.clone());
     }
@@ -58,7 +58,7 @@ fn decoder(path: &Path, frame: &FrameDescription) -> Result<impl ImageDecoder + 
 }
 
 /// Width and height of a frame's image, from its header.
-pub(super) fn image_size(frame: &FrameDescription) -> Result<(u32, u32), CameraError> {
+pub fn image_size(frame: &FrameDescription) -> Result<(u32, u32), CameraError> {
     Ok(decoder(&find(frame)?, frame)?.dimensions())
 }
 
@@ -121,9 +121,16 @@ impl Images {
         } else if input && alpha(&image, 0) {
             return Err(background("an image that is transparent everywhere".into()));
         }
-        if !frame.distortion.is_zero() {
-            frame.distortion.check(&camera, &frame.place)?;
-            image = frame.distortion.undistort(&image, &camera);
+        if frame.lens != Lens::Ideal {
+            if !frame.lens.is_one_to_one(&camera) {
+                return Err(CameraError::Field {
+                    place: place(),
+                    field: "k1, k2, k3, k4, p1, p2".into(),
+                    expected: "a distortion that maps the image one to one".into(),
+                    found: format!("{:?}, which folds it", frame.lens),
+                });
+            }
+            image = frame.lens.undistort(&image, &camera);
             self.undistorted += 1;
         }
         Ok(View { name: frame.name.clone(), camera, image })

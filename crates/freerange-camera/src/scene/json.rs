@@ -1,7 +1,7 @@
 //! Reading `transforms*.json`: every field checked, with its frame and name in the error.
 
-use super::{Distortion, files, pose};
-use crate::{Camera, CameraError, error::Place};
+use super::{files, pose};
+use crate::{Camera, CameraError, Lens, error::Place};
 use glam::DMat4;
 use serde_json::{Map, Value};
 use std::{
@@ -14,29 +14,37 @@ use std::{
 const LARGEST_FILE: u64 = 16 << 20;
 /// Largest image side accepted, in pixels.
 pub(super) const LARGEST_SIDE: u32 = 16384;
-/// Camera models that are a pinhole with at most the distortion that [`Distortion`] describes.
+/// Camera models that are a pinhole with at most the distortion that [`Lens`] describes.
 const PINHOLES: [&str; 6] = ["PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"];
-/// What a mask file means differs from program to program.
-const MASK_ADVICE: &str = "put the mask into the image's alpha channel";
+/// OpenCV's fisheye model, as nerfstudio and COLMAP call it.
+const FISHEYE: &str = "OPENCV_FISHEYE";
 
-/// One `transforms*.json`.
-pub(super) struct Description {
+/// One `transforms*.json`: every field checked, no image looked at.
+pub struct Description {
+    /// The file.
     pub file: PathBuf,
+    /// Its frames, one or more.
     pub frames: Vec<FrameDescription>,
+    /// What was understood, for the user to read.
     pub notes: Vec<String>,
     /// `train_filenames`, where the file has it.
     train: Option<HashSet<String>>,
 }
 
 /// One frame, its pose checked; the image itself has not been looked at.
-pub(super) struct FrameDescription {
+pub struct FrameDescription {
+    /// Which file and frame this is,, for messages.
     pub place: Place,
+    /// The image's file name without its extension.
     pub name: String,
-    /// `file_path` as resolved against the JSON's folder.
+    /// `file_path` as resolved against the JSON's folder; the extension may be missing.
     pub image: PathBuf,
+    /// `mask_path`, resolved likewise.
+    pub mask: Option<PathBuf>,
     /// `w` and `h`, where given.
     pub size: Option<(u32, u32)>,
-    pub distortion: Distortion,
+    /// Its lens.
+    pub lens: Lens,
     written: String,
     focal: Focal,
     principal: [Option<f64>; 2],
@@ -51,6 +59,7 @@ enum Focal {
 }
 
 impl Description {
+    /// Reads and checks a file.
     pub fn read(file: &Path) -> Result<Self, CameraError> {
         let place = Place { file: file.to_path_buf(), frame: None };
         let root: Value = serde_json::from_slice(&read_limited(file)?)
@@ -90,6 +99,18 @@ impl Description {
         Ok(Self { file: file.to_path_buf(), frames, notes, train })
     }
 
+    /// Refuses masks in files of their own, which only the crate `freerange-scene` reads.
+    pub(super) fn without_masks(self) -> Result<Self, CameraError> {
+        match self.frames.iter().find(|frame| frame.mask.is_some()) {
+            None => Ok(self),
+            Some(frame) => Err(CameraError::Unsupported {
+                place: frame.place.clone(),
+                feature: "`mask_path`".into(),
+                advice: "put the mask into the image's alpha channel",
+            }),
+        }
+    }
+
     /// The frames to reconstruct from, and the others.
     pub fn split(&self) -> (Vec<&FrameDescription>, Vec<&FrameDescription>) {
         self.frames.iter().partition(|f| self.train.as_ref().is_none_or(|t| t.contains(&f.written)))
@@ -118,13 +139,18 @@ impl FrameDescription {
         };
         let focal = fields.focal()?;
         let principal = [fields.number("cx")?, fields.number("cy")?];
-        let distortion = fields.distortion()?;
+        let lens = fields.lens()?;
+        let mask = match fields.get("mask_path") {
+            None => None,
+            Some(Value::String(path)) if !path.is_empty() => Some(folder.join(path)),
+            other => return Err(field(&place, "mask_path", "a file name", found(other))),
+        };
         let image = folder.join(&written);
         let name = files::name_of(&image);
         if name.is_empty() {
             return Err(field(&place, "file_path", "a file name", format!("{written:?}")));
         }
-        Ok(Self { name, image, size, distortion, written, focal, principal, world_to_camera, place })
+        Ok(Self { name, image, mask, size, lens, written, focal, principal, world_to_camera, place })
     }
 
     /// The frame's camera for an image of `size` (width, height): the file's own, or the image's where it has none.
@@ -206,23 +232,25 @@ impl Fields<'_> {
         }
     }
 
-    fn distortion(&self) -> Result<Distortion, CameraError> {
+    fn lens(&self) -> Result<Lens, CameraError> {
         let coefficient = |name: &str| match self.number(name)?.unwrap_or(0.0) {
             v if v.abs() <= 100.0 => Ok(v),
             _ => Err(self.wrong(name, "a distortion coefficient between -100 and 100")),
         };
         let k = [coefficient("k1")?, coefficient("k2")?, coefficient("k3")?, coefficient("k4")?];
-        let distortion = Distortion { k, p: [coefficient("p1")?, coefficient("p2")?] };
-        let model = self.get("camera_model").and_then(Value::as_str).unwrap_or("OPENCV");
-        if model.ends_with("PINHOLE") && !distortion.is_zero() {
-            return Err(field(
-                self.place,
-                "camera_model",
-                "OPENCV, as there are distortion coefficients",
-                model.into(),
-            ));
+        let p = [coefficient("p1")?, coefficient("p2")?];
+        if self.fisheye()? {
+            return match p {
+                [0.0, 0.0] => Ok(Lens::Fisheye { k }),
+                _ => Err(self.wrong("p1", "no tangential coefficients with a fisheye")),
+            };
         }
-        Ok(distortion)
+        let lens = Lens::brown(k, p);
+        let model = self.get("camera_model").and_then(Value::as_str).unwrap_or("OPENCV");
+        if model.ends_with("PINHOLE") && lens != Lens::Ideal {
+            return Err(self.wrong("camera_model", "OPENCV, as there are distortion coefficients"));
+        }
+        Ok(lens)
     }
 
     fn transform_matrix(&self) -> Result<Vec<[f64; 4]>, CameraError> {
@@ -243,18 +271,29 @@ impl Fields<'_> {
         rows.iter().map(|r| row(r).ok_or_else(|| wrong(format!("the row {}", describe(r))))).collect()
     }
 
+    /// Whether the model is a fisheye, by name or by instant-ngp's flag.
+    fn fisheye(&self) -> Result<bool, CameraError> {
+        let flag = match self.get("is_fisheye") {
+            None => false,
+            Some(Value::Bool(flag)) => *flag,
+            Some(_) => return Err(self.wrong("is_fisheye", "true or false")),
+        };
+        let named = self.get("camera_model").and_then(Value::as_str) == Some(FISHEYE);
+        if flag && !named && self.get("camera_model").is_some() {
+            return Err(self.wrong("camera_model", "OPENCV_FISHEYE, as `is_fisheye` is true"));
+        }
+        Ok(flag || named)
+    }
+
     /// Names what would change the picture if it were ignored.
     fn refuse_unsupported(&self) -> Result<(), CameraError> {
         let refuse =
             |feature: String, advice| Err(CameraError::Unsupported { place: self.place.clone(), feature, advice });
         let undistort = "undistort the images first";
         match self.get("camera_model") {
-            Some(Value::String(model)) if PINHOLES.contains(&model.as_str()) => {}
+            Some(Value::String(model)) if PINHOLES.contains(&model.as_str()) || model == FISHEYE => {}
             Some(model) => return refuse(format!("`camera_model` {}", describe(model)), undistort),
             None => {}
-        }
-        if self.get("is_fisheye").is_some_and(|v| *v != Value::Bool(false)) {
-            return refuse("`is_fisheye`".into(), undistort);
         }
         for name in ["k5", "k6"] {
             if self.number(name)?.is_some_and(|v| v != 0.0) {
@@ -266,9 +305,6 @@ impl Fields<'_> {
             if !zero {
                 return refuse("`distortion_params`".into(), "write the coefficients as k1 to k4, p1, p2");
             }
-        }
-        if self.get("mask_path").is_some() {
-            return refuse("`mask_path`".into(), MASK_ADVICE);
         }
         Ok(())
     }

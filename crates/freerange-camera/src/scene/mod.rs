@@ -5,19 +5,19 @@
 //! camera-to-world with OpenGL axes; here they become OpenCV's world-to-camera.
 
 mod cutout;
-mod distortion;
 mod files;
 mod json;
 mod pose;
 mod write;
 
 pub use cutout::{BACKGROUND_TOLERANCE, cut_out};
-pub use distortion::Distortion;
+pub use files::{find, image_size};
+pub use json::{Description, FrameDescription};
+pub use pose::nearest_rotation;
 pub use write::transforms_json;
 
 use crate::{Camera, CameraError, View, error::Place};
 use files::Images;
-use json::{Description, FrameDescription};
 use std::path::{Path, PathBuf};
 
 /// Posed images of one object.
@@ -42,7 +42,7 @@ impl Scene {
         let found = Found::at(path)?;
         let mut notes = found.notes;
         let mut files = vec![found.inputs.clone()];
-        let description = Description::read(&found.inputs)?;
+        let description = Description::read(&found.inputs)?.without_masks()?;
         let (train, rest) = description.split();
         let whole = Place { file: found.inputs.clone(), frame: None };
         if train.len() < 2 {
@@ -54,7 +54,7 @@ impl Scene {
         let mut further = images.load_all(&description, &rest, false)?;
         notes.extend(description.notes);
         if let Some(file) = found.further {
-            let description = Description::read(&file)?;
+            let description = Description::read(&file)?.without_masks()?;
             let all: Vec<&FrameDescription> = description.frames.iter().collect();
             further.extend(images.load_all(&description, &all, false)?);
             notes.extend(description.notes);
@@ -73,7 +73,7 @@ impl Scene {
 /// `w` and `h`, and then only their headers are read. Lens distortion is left out: the cameras are those of the
 /// undistorted images.
 pub fn load_cameras(path: &Path) -> Result<Vec<(String, Camera)>, CameraError> {
-    let description = Description::read(&Found::at(path)?.inputs)?;
+    let description = Description::read(&Found::at(path)?.inputs)?.without_masks()?;
     description
         .frames
         .iter()
@@ -88,14 +88,18 @@ pub fn load_cameras(path: &Path) -> Result<Vec<(String, Camera)>, CameraError> {
 }
 
 /// Which files make up a scene.
-struct Found {
-    inputs: PathBuf,
-    further: Option<PathBuf>,
-    notes: Vec<String>,
+pub struct Found {
+    /// The file with the input views.
+    pub inputs: PathBuf,
+    /// The file with further views.
+    pub further: Option<PathBuf>,
+    /// What was passed over.
+    pub notes: Vec<String>,
 }
 
 impl Found {
-    fn at(path: &Path) -> Result<Self, CameraError> {
+    /// Looks into a folder, or takes one file as it is.
+    pub fn at(path: &Path) -> Result<Self, CameraError> {
         let unreadable = |source| CameraError::Read { file: path.to_path_buf(), source };
         if !std::fs::metadata(path).map_err(unreadable)?.is_dir() {
             return Ok(Self { inputs: path.to_path_buf(), further: None, notes: Vec::new() });

@@ -39,7 +39,7 @@ pub fn world_to_camera(rows: &[[f64; 4]], place: &Place) -> Result<DMat4, Camera
 }
 
 /// The rotation nearest to a matrix that is one up to rounding; otherwise what the matrix is instead.
-fn nearest_rotation(m: DMat3) -> Result<DMat3, String> {
+pub fn nearest_rotation(m: DMat3) -> Result<DMat3, String> {
     let gram = m.transpose() * m;
     let largest = |m: DMat3| m.to_cols_array().iter().fold(0.0f64, |a, v| a.max(v.abs()));
     let scale_squared = (gram.x_axis.x + gram.y_axis.y + gram.z_axis.z) / 3.0;

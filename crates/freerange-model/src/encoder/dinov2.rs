@@ -91,7 +91,7 @@ impl Dinov2 {
             layers: (0..config.layers).map(|i| Layer::build(config, i, builder)).collect::<Result<_, _>>()?,
             norm: LayerNorm::build("layernorm", d, builder)?,
             stored_position: position.into(),
-            config: config.clone(),
+            config: config.architecture(),
             origin: None,
         })
     }
@@ -102,6 +102,15 @@ impl Dinov2 {
     /// # Errors
     /// Names the file, and the field or tensor that is missing or does not fit.
     pub fn load(folder: &Path, device: &Device) -> Result<Self, ModelError> {
+        let name = folder.file_name().unwrap_or(folder.as_os_str()).to_string_lossy();
+        Self::load_as(folder, &name, device)
+    }
+
+    /// [`load`](Self::load) of weights that are known by `name`: checkpoints record it.
+    ///
+    /// # Errors
+    /// As [`load`](Self::load).
+    pub fn load_as(folder: &Path, name: &str, device: &Device) -> Result<Self, ModelError> {
         let config = read_config(&folder.join("config.json"))?;
         let path = folder.join("model.safetensors");
         let bytes = read_bounded(&path)?;
@@ -109,7 +118,7 @@ impl Dinov2 {
         let mut model = Self::build(&config, &mut Builder { source: &mut file, device })?.freeze();
         let hash = Sha256::digest(&bytes);
         model.origin = Some(WeightsOrigin {
-            name: folder.file_name().unwrap_or(folder.as_os_str()).to_string_lossy().into_owned(),
+            name: name.to_owned(),
             sha256: hash.iter().map(|byte| format!("{byte:02x}")).collect(),
         });
         Ok(model)
@@ -346,6 +355,8 @@ fn read_config(path: &Path) -> Result<Dinov2Config, ModelError> {
         layer_norm_eps: c.layer_norm_eps,
         qkv_bias: c.qkv_bias,
         antialias: c.model_type == "dinov2_with_registers",
+        weights: None,
+        random: false,
     };
     config.validate().map_err(|e| ModelError::format(path, KIND, e))?;
     Ok(config)

@@ -24,7 +24,8 @@ use crate::{
 #[derive(Module, Debug)]
 pub struct ImageEncoder {
     patch: Option<PatchMlp>,
-    dinov2: Option<Dinov2>,
+    dinov2: Option<Dinov2>, // none, too, while it is taken out
+    outside: bool,
     patch_size: usize,
     channels: usize,
     position_features: usize,
@@ -44,6 +45,7 @@ impl ImageEncoder {
         Ok(Self {
             patch,
             dinov2,
+            outside: matches!(config.encoder, EncoderConfig::Dinov2(_)),
             patch_size: config.encoder.patch_size() as usize,
             channels: config.encoder.channels(),
             position_features: config.position_features,
@@ -61,8 +63,8 @@ impl ImageEncoder {
         }
     }
 
-    pub(crate) fn replace_dinov2(&mut self, dinov2: Dinov2) {
-        self.dinov2 = Some(dinov2);
+    pub(crate) fn replace_dinov2(&mut self, dinov2: Option<Dinov2>) -> Option<Dinov2> {
+        std::mem::replace(&mut self.dinov2, dinov2)
     }
 
     /// Image tokens.
@@ -73,11 +75,12 @@ impl ImageEncoder {
     /// Returns `[b, views * rows * columns, features + position + 3 + 6]`; view by view, row by row.
     ///
     /// # Panics
-    /// If shapes do not fit each other or the configuration.
+    /// If shapes do not fit each other or the configuration, or the DINOv2 is taken out.
     pub fn forward(&self, images: Tensor<5>, plucker: Tensor<5>) -> Tensor<3> {
         let [b, views, h, w, channels] = images.dims();
         let p = self.patch_size;
         let (rows, columns) = (h / p, w / p);
+        assert_eq!(self.outside, self.dinov2.is_some(), "the frozen encoder is in its place");
         assert_eq!(channels, self.channels, "channels of the images");
         assert!(h == rows * p && w == columns * p, "{h} x {w} images are not whole patches of {p}");
         assert_eq!(plucker.dims(), [b, views, rows, columns, PLUCKER], "one ray per patch");

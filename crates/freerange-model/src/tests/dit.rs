@@ -239,7 +239,7 @@ fn what_is_known_is_corrected() {
     let images = Tensor::<3>::ones([3, 4, config.image_token_width()], &device);
     let z = Tensor::<3>::ones([3, 8, 14], &device);
     let t = || Tensor::from_floats([0.0, 0.4, 1.0], &device);
-    let feedback = Feedback { gradient: Some(z.clone()), estimate: Some(z.clone().mul_scalar(0.7)) };
+    let feedback = Feedback { gradient: Some(z.clone()), estimate: Some(z.clone().mul_scalar(0.7)), observation: None };
     // The last layer starts at zero. At the start only the estimate counts, at the end only the sample; in between they
     // are weighed by their variances: the sample's, told by z / t, is ((1 - t) / t)^2, the estimate's 0.5^2.
     let first = numbers(model.denoise(z.clone(), feedback.clone(), images.clone(), t()));

@@ -4,15 +4,10 @@ mod kernels;
 mod timer;
 mod whole;
 
-use burn::tensor::Device;
-use freerange_model::Compute;
+use freerange::{Compute, Device, DeviceName, devices, require};
 use serde::Serialize;
 
-use crate::{
-    device::{DeviceName, all, parse_compute, require},
-    error::CliError,
-    runtime,
-};
+use crate::{commands::reconstruct::parse_compute, error::CliError, runtime};
 
 /// Measure speed on a device: the rasteriser, a transformer block, sampling, training.
 ///
@@ -102,7 +97,7 @@ struct Report {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
     let device = args.device.open()?;
-    let listed = all().into_iter().find(|d| d.is(&device));
+    let listed = devices().into_iter().find(|d| d.is(&device));
     let (name, hardware, gpu) = listed
         .map_or_else(|| (args.device.to_string(), "unknown".into(), false), |d| (d.name, d.properties.hardware, d.gpu));
     let compute = args.compute.unwrap_or(match gpu && Compute::Bf16.supported(&device) {

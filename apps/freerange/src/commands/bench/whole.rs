@@ -13,7 +13,7 @@ use freerange_flow::{
     sample::{SampleConfig, reconstruct},
     trainer::Trainer,
 };
-use freerange_model::{Checkpoint, Compute, Execution, FreeRange, ModelConfig, ModelInfo, Workload};
+use freerange_model::{Checkpoint, Compute, EncoderConfig, Execution, FreeRange, ModelConfig, ModelInfo, Workload};
 use freerange_splat::Statistics;
 use rand::SeedableRng;
 use serde::Serialize;
@@ -76,6 +76,10 @@ impl Sample {
 fn load(size: &str) -> Result<TrainConfig, CliError> {
     let mut config = TrainConfig::load(Path::new(size))?;
     config.data.shards = None;
+    // Time does not depend on weights.
+    if let EncoderConfig::Dinov2(encoder) = &mut config.model.encoder {
+        (encoder.weights, encoder.random) = (None, true);
+    }
     config.data.object.gaussians = GaussianSource::Surface;
     config.data.object.polish = 0;
     let most = config.stages.iter().map(|s| 1usize << s.depth).max().unwrap_or(1);
@@ -150,7 +154,7 @@ pub fn sample(
     let fits = fit.map(|fit| vec![fit; objects]);
     let run = |steps| {
         let settings = SampleConfig { steps, ..settings.clone() };
-        reconstruct(&checkpoint, &batch, fits.as_deref(), &settings, &[0], device, |_| {})
+        reconstruct(&checkpoint, &batch, fits.as_deref(), &settings, &[0], device, |_| ControlFlow::Continue(()))
     };
     run(1)?;
     let begin = Instant::now();

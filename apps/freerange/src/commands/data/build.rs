@@ -6,9 +6,10 @@ use std::sync::Mutex;
 use freerange_data::{
     BuildConfig, BuildOptions, GaussianSource, HeldOutPsnr, Items, Seconds, Share, Store, Summary, build,
 };
+use freerange_eval::memory::peak_memory;
 use freerange_flow::config::TrainConfig;
 
-use crate::{error::CliError, progress::Progress, runtime::peak_memory};
+use crate::{error::CliError, progress::Progress};
 
 /// Arguments of `data build`.
 #[derive(clap::Args)]

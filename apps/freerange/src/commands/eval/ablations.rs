@@ -2,20 +2,20 @@
 
 use std::path::PathBuf;
 
+use freerange::{Options, SampleConfig};
 use freerange_eval::{
     Report, RunFolder,
     ablation::{Set, Study, Values, Variant, variants},
+    runner::{Run, report},
 };
-use freerange_flow::sample::SampleConfig;
 use serde_json::Value;
 
 use super::{
     args::RunArgs,
     methods::{Method, MethodName},
-    runner::{Run, report, work},
-    verdict,
+    verdict, work,
 };
-use crate::{error::CliError, pipeline::Options};
+use crate::error::CliError;
 
 /// Arguments of `eval ablations`.
 #[derive(clap::Args)]
@@ -74,8 +74,8 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         return Err(CliError::input(format!("--input-counts: expected 2 to 64, found {n}")));
     }
     let device = a.sampling.device.open()?;
-    let (method, checkpoint) = a.open_method(&device)?;
-    let Method::Model { options: default, sha256 } = &method else {
+    let method = a.open_method(&device)?;
+    let Method::Model { model, options: default, sha256 } = &method else {
         return Err(CliError::failure("a model's method expected"));
     };
     let values = Values {
@@ -97,13 +97,14 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         let same = options.sample == default.sample && count == inputs;
         planned.push((variant, (!same).then_some((options, count))));
     }
-    let shared = a.open_shared(&device, checkpoint, args.json)?;
+    let (shared, source) = a.open_shared(&device)?;
     let open = |folder: &str, options: &Options, count: usize| {
-        let method = Method::Model { options: options.clone(), sha256: sha256.clone() };
-        let settings = a.settings(&method, &[count], &shared);
+        let method = Method::Model { model: model.clone(), options: Box::new(options.clone()), sha256: sha256.clone() };
+        let settings = a.settings(&method, &[count], &shared, &source);
         let path = args.output.join(folder);
         let prefix = format!("{folder}: ");
         let folder = RunFolder::open(&path, &settings, a.restart)?;
+        let method = Box::new(method);
         Ok::<_, CliError>(Run { method, folder, settings, views: a.views.sets(), inputs: vec![count], prefix })
     };
     let mut runs = vec![open(DEFAULT, default, inputs)?];
@@ -117,13 +118,13 @@ pub fn run(args: &Args) -> Result<(), CliError> {
             }
         });
     }
-    work(&runs, &shared)?;
+    work(&runs, &shared, args.json)?;
     if a.share.is_some() {
         println!("this share is done; run again without --share for the report");
         return Ok(());
     }
     let environment = a.environment(&device);
-    let reports = runs.iter().map(|r| report(r, &shared, &environment)).collect::<Result<Vec<Report>, CliError>>()?;
+    let reports = runs.iter().map(|r| report(r, &shared, &environment)).collect::<Result<Vec<Report>, _>>()?;
     if reports[0].measured().next().is_none() {
         return verdict(&reports[..1]);
     }
@@ -155,7 +156,9 @@ fn apply(variant: &Variant, default: &Options) -> Result<Options, CliError> {
     let value: Value = serde_json::to_value(&default.sample).map_err(|e| refuse(&e))?;
     let sample: SampleConfig = serde_json::from_value(variant.apply(&value)).map_err(|e| refuse(&e))?;
     sample.validate().map_err(|e| refuse(&e))?;
-    Ok(Options { sample, ..default.clone() })
+    let mut options = default.clone();
+    options.sample = sample;
+    Ok(options)
 }
 
 fn document(study: &Study, environment: &freerange_eval::Environment) -> String {

@@ -2,20 +2,23 @@
 
 use std::{path::PathBuf, sync::Arc};
 
-use freerange_eval::{Environment, Scorer, ScorerConfig, record::ViewSet};
+use freerange::{Device, checkpoint_sha256, machine};
+use freerange_eval::{
+    Environment, Scorer, ScorerConfig,
+    record::ViewSet,
+    runner::{self, Shared},
+};
 use freerange_metrics::Metric;
-use freerange_model::Checkpoint;
 use serde_json::{Value, json};
 
 use super::{
     methods::{Method, MethodName, fit_config},
-    runner::Shared,
-    sources::SourceArgs,
+    sources::{Source, SourceArgs},
 };
 use crate::{
     commands::reconstruct::Sampling,
     error::CliError,
-    runtime::{checkpoint, checkpoint_sha256, memory, processor},
+    runtime::{commit, local_or_shipped},
 };
 
 /// What is evaluated, and how.
@@ -107,6 +110,16 @@ pub enum Pictures {
     All,
 }
 
+impl From<Pictures> for runner::Pictures {
+    fn from(pictures: Pictures) -> Self {
+        match pictures {
+            Pictures::None => Self::None,
+            Pictures::Extremes => Self::Extremes,
+            Pictures::All => Self::All,
+        }
+    }
+}
+
 fn share(text: &str) -> Result<(usize, usize), String> {
     let parts = text.split_once('/').and_then(|(i, n)| Some((i.parse().ok()?, n.parse().ok()?)));
     match parts {
@@ -116,8 +129,8 @@ fn share(text: &str) -> Result<(usize, usize), String> {
 }
 
 impl RunArgs {
-    /// The method, and the checkpoint if it needs one.
-    pub fn open_method(&self, device: &burn::tensor::Device) -> Result<(Method, Option<Arc<Checkpoint>>), CliError> {
+    /// The method, and whatever it needs.
+    pub fn open_method(&self, device: &Device) -> Result<Method, CliError> {
         let refuse = |problem: &str| Err(CliError::input(problem));
         match (self.method, &self.ply) {
             (MethodName::Ply, None) => return refuse("--method ply: expected --ply DIR as well"),
@@ -134,63 +147,60 @@ impl RunArgs {
             return refuse("--method white and ply: expected one sample and one number of inputs, they change nothing");
         }
         let samples = matches!(self.method, MethodName::Model | MethodName::Start);
-        if !samples && self.sampling.refine > 0 {
+        if !samples && self.sampling.refine.is_some() {
             return refuse("--refine goes with --method model and start only");
         }
         Ok(match self.method {
             MethodName::Model | MethodName::Start => {
-                let path = self.sampling.checkpoint.as_deref();
-                let checkpoint = checkpoint(path, device)?;
-                let mut options = self.sampling.options(&checkpoint, self.samples, device)?;
-                options.quiet = true;
+                let model = self.sampling.open(device)?;
+                let mut options = self.sampling.options(&model, self.samples)?;
                 options.without_network = self.method == MethodName::Start;
                 if options.without_network && options.sample.start.is_none() {
                     return refuse(
                         "--method start: expected a checkpoint that starts from a quick fit, or --start fit",
                     );
                 }
-                (Method::Model { options, sha256: checkpoint_sha256(path)? }, Some(Arc::new(checkpoint)))
+                let sha256 = checkpoint_sha256(local_or_shipped(self.sampling.checkpoint.as_deref())?.as_deref())?;
+                Method::Model { model: Arc::new(model), options: Box::new(options), sha256 }
             }
             MethodName::Fit => {
                 let seeds = (0..u64::from(self.samples)).map(|i| self.sampling.seed.wrapping_add(i)).collect();
                 let config = Box::new(fit_config(self.fit_iterations, self.fit_size));
-                (Method::Fit { config, seeds, up: self.sampling.up() }, None)
+                Method::Fit { config, seeds, up: self.sampling.up.or_z() }
             }
-            MethodName::White => (Method::White, None),
-            MethodName::Ply => (Method::Ply(self.ply.clone().unwrap_or_default()), None),
+            MethodName::White => Method::White,
+            MethodName::Ply => Method::Ply(self.ply.clone().unwrap_or_default()),
         })
     }
 
-    /// Opens everything that runs share.
-    pub fn open_shared(
-        &self,
-        device: &burn::tensor::Device,
-        checkpoint: Option<Arc<Checkpoint>>,
-        quiet: bool,
-    ) -> Result<Shared, CliError> {
-        let source = self.source.open()?;
+    /// Opens everything that runs share, and what the objects' numbers depend on.
+    pub fn open_shared(&self, device: &Device) -> Result<(Shared, Value), CliError> {
+        let source: Source = self.source.open()?;
+        let settings = source.settings().clone();
         let config = ScorerConfig {
             metrics: self.metrics.clone(),
-            weights: self.weights.iter().cloned().chain(crate::runtime::weights_folder()).collect(),
+            weights: self.weights.iter().cloned().chain(machine::weights_folder()).collect(),
             dino: self.dino.clone(),
         };
         #[cfg(feature = "networks")]
         let scorer = Scorer::open(&config, device)?;
         #[cfg(not(feature = "networks"))]
-        let scorer = Scorer::open(&config)?;
+        let scorer = {
+            let _ = device; // of the networks
+            Scorer::open(&config)?
+        };
         if scorer.metrics().is_empty() {
             let reasons: Vec<&String> = scorer.missing().values().collect();
             return Err(CliError::input(format!("no metric can be computed: {reasons:?}")));
         }
-        Ok(Shared {
-            source,
+        let shared = Shared {
+            objects: Box::new(source),
             scorer,
-            checkpoint,
-            device: device.clone(),
-            pictures: self.pictures,
+            pictures: self.pictures.into(),
             share: self.share.unwrap_or((0, 1)),
-            quiet,
-        })
+            commit: commit(),
+        };
+        Ok((shared, settings))
     }
 
     /// Numbers of inputs, each once.
@@ -202,25 +212,25 @@ impl RunArgs {
     }
 
     /// What the numbers of a run depend on.
-    pub fn settings(&self, method: &Method, inputs: &[usize], shared: &Shared) -> Value {
+    pub fn settings(&self, method: &Method, inputs: &[usize], shared: &Shared, source: &Value) -> Value {
         json!({
-            "source": shared.source.settings(), "method": method.settings(), "views": self.views.sets(),
+            "source": source, "method": method.settings(), "views": self.views.sets(),
             "inputs": inputs, "metrics": shared.scorer.metrics(), "weights": shared.scorer.used_files(),
         })
     }
 
     /// Where and how this process runs.
-    pub fn environment(&self, device: &burn::tensor::Device) -> Environment {
+    pub fn environment(&self, device: &Device) -> Environment {
         let plain = |c: char| c.is_ascii_alphanumeric() || "-_./=:,".contains(c);
         let quoted = |a: String| if !a.is_empty() && a.chars().all(plain) { a } else { format!("{a:?}") };
         let arguments = std::env::args_os().skip(1).map(|a| quoted(a.to_string_lossy().into_owned()));
         Environment {
             command: std::iter::once("freerange".to_owned()).chain(arguments).collect::<Vec<_>>().join(" "),
             commits: Vec::new(),
-            processor: processor(),
+            processor: machine::processor(),
             threads: std::thread::available_parallelism().map_or(1, usize::from),
-            memory_bytes: memory(),
-            device: match crate::device::all().into_iter().find(|d| d.is(device)) {
+            memory_bytes: machine::memory(),
+            device: match freerange::devices().into_iter().find(|d| d.is(device)) {
                 Some(d) if d.gpu => format!("{} ({})", d.name, d.properties.hardware),
                 Some(d) => d.name,
                 None => self.sampling.device.to_string(),

@@ -3,20 +3,19 @@
 use std::{
     ops::ControlFlow,
     path::{Path, PathBuf},
+    sync::Arc,
 };
 
-use burn::tensor::Device;
-use freerange_camera::View;
-use freerange_eval::record::ViewSet;
+use freerange::{FrameConfig, Options, Reconstructor, Up, View, to_canonical, to_user};
+use freerange_eval::{
+    record::{Case, ViewSet},
+    runner::{self, Made},
+};
 use freerange_fit::{FitConfig, Rates, fit};
-use freerange_model::Checkpoint;
 use freerange_splat::{Cloud, read_ply};
 use serde_json::{Value, json};
 
-use crate::{
-    error::CliError,
-    pipeline::{self, Options, to_user},
-};
+use crate::error::CliError;
 
 /// What is measured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -38,8 +37,10 @@ pub enum MethodName {
 pub enum Method {
     /// The model.
     Model {
+        /// Itself.
+        model: Arc<Reconstructor>,
         /// How it samples.
-        options: Options,
+        options: Box<Options>,
         /// SHA-256 of the checkpoint.
         sha256: String,
     },
@@ -50,20 +51,12 @@ pub enum Method {
         /// Seeds.
         seeds: Vec<u64>,
         /// Which way is up.
-        up: freerange_camera::Up,
+        up: Up,
     },
     /// Nothing.
     White,
     /// `NAME.ply` in this folder, or in `full/` and `partial/` below it.
     Ply(PathBuf),
-}
-
-/// What a method made.
-pub struct Made {
-    /// Seeds and Gaussians in the frame of the object's cameras.
-    pub clouds: Vec<(u64, Cloud)>,
-    /// What the user should know.
-    pub notes: Vec<String>,
 }
 
 /// 3DGS-MCMC as a user without a model would run it, with rates chosen for long fits that start from the hull of a few
@@ -78,15 +71,16 @@ pub fn fit_config(iterations: usize, size: u32) -> FitConfig {
     }
 }
 
-impl Method {
-    /// What it is called in tables.
-    pub fn label(&self) -> String {
+impl runner::Method for Method {
+    fn label(&self) -> String {
         match self {
-            Self::Model { options, .. } if options.without_network => match options.refine {
+            Self::Model { options, .. } if options.without_network => match options.sample.refine {
                 0 => "without the network".into(),
                 steps => format!("without the network, refined {steps}"),
             },
-            Self::Model { options, .. } if options.refine > 0 => format!("model, refined {}", options.refine),
+            Self::Model { options, .. } if options.sample.refine > 0 => {
+                format!("model, refined {}", options.sample.refine)
+            }
             Self::Model { .. } => "model".into(),
             Self::Fit { .. } => "3DGS-MCMC fit".into(),
             Self::White => "white".into(),
@@ -94,12 +88,18 @@ impl Method {
         }
     }
 
+    fn make(&self, case: &Case, inputs: &[View]) -> Result<Made, String> {
+        self.gaussians(case, inputs).map_err(|e| e.to_string())
+    }
+}
+
+impl Method {
     /// What its numbers depend on.
     pub fn settings(&self) -> Value {
         match self {
-            Self::Model { options, sha256 } => json!({
+            Self::Model { options, sha256, .. } => json!({
                 "name": if options.without_network { "start" } else { "model" }, "checkpoint_sha256": sha256, "sample": options.sample, "seeds": options.seeds,
-                "refine": options.refine, "up": format!("{:?}", options.up).to_lowercase(),
+                "refine": options.sample.refine, "up": format!("{:?}", options.frame.up).to_lowercase(),
             }),
             Self::Fit { config, seeds, up } => json!({
                 "name": "fit", "fit": config, "seeds": seeds, "up": format!("{up:?}").to_lowercase(),
@@ -109,26 +109,18 @@ impl Method {
         }
     }
 
-    /// Gaussians for an object.
-    pub fn make(
-        &self,
-        object: &str,
-        views: ViewSet,
-        inputs: &[View],
-        checkpoint: Option<&Checkpoint>,
-        device: &Device,
-    ) -> Result<Made, CliError> {
+    fn gaussians(&self, case: &Case, inputs: &[View]) -> Result<Made, CliError> {
         let mut notes = Vec::new();
         let clouds = match self {
-            Self::Model { options, .. } => {
-                let checkpoint = checkpoint.ok_or_else(|| CliError::failure("a model without a checkpoint"))?;
-                let result = pipeline::run(inputs, checkpoint, options, device)?;
-                notes = result.frame.notes;
-                let frame = result.frame.canonical_from_user;
-                result.samples.into_iter().map(|s| (s.seed, to_user(&s.refined, &frame))).collect()
+            Self::Model { model, options, .. } => {
+                let mut options = options.clone();
+                options.views = Some(inputs.len());
+                let result = model.run(inputs, &options, &mut |_| ControlFlow::Continue(()))?;
+                notes = result.notes;
+                result.samples.into_iter().map(|s| (s.seed, s.gaussians)).collect()
             }
             Self::Fit { config, seeds, up } => {
-                let (frame, canonical) = pipeline::to_canonical(inputs, *up)?;
+                let (frame, canonical) = to_canonical(inputs, &FrameConfig { up: *up, ..FrameConfig::default() })?;
                 let fitted = |&seed: &u64| {
                     let config = FitConfig { seed, ..(**config).clone() };
                     let cloud = fit(&canonical, None, &config, |_| ControlFlow::Continue(()))?;
@@ -139,7 +131,7 @@ impl Method {
             }
             Self::White => vec![(0, Cloud::default())],
             Self::Ply(folder) => {
-                let file = read_ply(&ply_file(folder, object, views)?)?;
+                let file = read_ply(&ply_file(folder, &case.object, case.views)?)?;
                 notes = file.notes;
                 vec![(0, file.cloud)]
             }

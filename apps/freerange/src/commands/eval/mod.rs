@@ -4,16 +4,18 @@ mod ablations;
 mod args;
 mod compare;
 mod methods;
-mod runner;
 mod sources;
 
 use std::path::{Path, PathBuf};
 
-use freerange_eval::{Report, RunFolder, record::style};
+use freerange_eval::{
+    Report, RunFolder,
+    record::style,
+    runner::{Event, Run, Shared, line, report},
+};
 
-use crate::error::CliError;
+use crate::{error::CliError, progress::Progress};
 use args::RunArgs;
-use runner::{Run, report, work};
 
 /// Arguments of `eval`.
 #[derive(clap::Args)]
@@ -62,14 +64,14 @@ fn evaluate(args: &Args) -> Result<(), CliError> {
     };
     let a = &args.run;
     let device = a.sampling.device.open()?;
-    let (method, checkpoint) = a.open_method(&device)?;
-    let shared = a.open_shared(&device, checkpoint, args.json)?;
+    let method = a.open_method(&device)?;
+    let (shared, source) = a.open_shared(&device)?;
     let inputs = a.inputs();
-    let settings = a.settings(&method, &inputs, &shared);
+    let settings = a.settings(&method, &inputs, &shared, &source);
     let folder = RunFolder::open(output, &settings, a.restart)?;
-    let run = Run { method, folder, settings, views: a.views.sets(), inputs, prefix: String::new() };
+    let run = Run { method: Box::new(method), folder, settings, views: a.views.sets(), inputs, prefix: String::new() };
     let runs = [run];
-    work(&runs, &shared)?;
+    work(&runs, &shared, args.json)?;
     if a.share.is_some() {
         println!("this share is done; run again without --share for the report");
         return Ok(());
@@ -80,6 +82,26 @@ fn evaluate(args: &Args) -> Result<(), CliError> {
         false => print(&report, output),
     }
     verdict([&report])
+}
+
+/// Works on all cases, and says so on the screen; `quiet`: with a bar alone.
+fn work(runs: &[Run], shared: &Shared, quiet: bool) -> Result<(), CliError> {
+    let mut bar = None;
+    freerange_eval::runner::work(runs, shared, &mut |event| match event {
+        Event::Cases { done, total, object } => {
+            let bar = bar.get_or_insert_with(|| Progress::new("evaluating", total as u64));
+            bar.at(done as u64, object);
+        }
+        Event::Record { run, record } => {
+            if let (Some(bar), false) = (&bar, quiet) {
+                bar.line(&line(run, record));
+            }
+        }
+    })?;
+    if let Some(bar) = bar {
+        bar.finish();
+    }
+    Ok(())
 }
 
 /// What a finished run says on the screen.

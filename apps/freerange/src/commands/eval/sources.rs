@@ -7,7 +7,7 @@ use std::{
 
 use freerange_camera::{Scene, View};
 use freerange_data::{BuildConfig, Item, Items, ObjectSource, Shards, Split, Store, render_views};
-use freerange_eval::EvalObject;
+use freerange_eval::{EvalObject, runner::Objects};
 use freerange_flow::config::TrainConfig;
 use serde_json::{Value, json};
 
@@ -149,19 +149,23 @@ impl SourceArgs {
     }
 }
 
-impl Source {
-    /// Names of the objects, all different.
-    pub fn names(&self) -> &[String] {
+impl Objects for Source {
+    fn names(&self) -> &[String] {
         &self.names
     }
 
+    fn load(&self, index: usize) -> Result<EvalObject, String> {
+        self.object(index).map_err(|e| e.to_string())
+    }
+}
+
+impl Source {
     /// What the numbers depend on.
     pub fn settings(&self) -> &Value {
         &self.settings
     }
 
-    /// Object number `index`.
-    pub fn load(&self, index: usize) -> Result<EvalObject, CliError> {
+    fn object(&self, index: usize) -> Result<EvalObject, CliError> {
         let name = &self.names[index];
         match &self.kind {
             Kind::Scenes { folders, files } => load_scene(name, &folders[index], files),

@@ -1,0 +1,81 @@
+//! `freerange model export`
+
+use std::path::PathBuf;
+
+use freerange::{checkpoint_bytes, checkpoint_header};
+use freerange_model::Header;
+
+use crate::{error::CliError, output::OutputFolder, runtime};
+
+/// Arguments of `model export`.
+#[derive(clap::Args)]
+pub struct Args {
+    /// Folder to write: config.json, model.safetensors and README.md, as model hubs expect them.
+    output: PathBuf,
+    /// Checkpoint to export instead of the shipped one: a file, or hf:owner/name[@revision].
+    #[arg(long, value_name = "FILE", requires = "license")]
+    checkpoint: Option<PathBuf>,
+    /// Licences of the model, as hubs call them [default: mit,apache-2.0 of the shipped checkpoint].
+    #[arg(long, value_name = "LICENCES", value_delimiter = ',', value_parser = parse_license)]
+    license: Vec<String>,
+    /// Title of the card [default: free-range].
+    #[arg(long, default_value = "free-range")]
+    name: String,
+}
+
+/// Names that hubs use: what is not plain could break the card's head.
+fn parse_license(text: &str) -> Result<String, String> {
+    let plain = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || "-._".contains(c);
+    match !text.is_empty() && text.chars().all(plain) {
+        true => Ok(text.into()),
+        false => Err("expected a hub's name of a licence, such as mit or cc-by-4.0".into()),
+    }
+}
+
+/// What is known of the shipped checkpoint; links in it lead to files beside it.
+const SHIPPED_CARD: &str = include_str!("../../../../docs/model-card.md");
+
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), CliError> {
+    let path = runtime::local_or_shipped(args.checkpoint.as_deref())?;
+    let bytes = checkpoint_bytes(path.as_deref())?;
+    let checkpoint = checkpoint_header(path.as_deref())?;
+    let config = serde_json::json!({
+        "model_type": "free-range",
+        "library_name": "freerange",
+        "gaussians": 1u64 << checkpoint.depth,
+        "architecture": checkpoint.config,
+        "sample": checkpoint.provenance.get("sample"),
+    });
+    let output = OutputFolder::create("model export", &args.output)?;
+    output.write("config.json", (serde_json::to_string_pretty(&config).map_err(CliError::input)? + "\n").as_bytes())?;
+    output.write(runtime::WEIGHTS, &bytes)?;
+    output.write("README.md", card(args, &checkpoint)?.as_bytes())?;
+    output.commit()?;
+    println!("{}", args.output.display());
+    Ok(())
+}
+
+/// The model's card: what hubs read, how it is used, what is known of it.
+fn card(args: &Args, checkpoint: &Header) -> Result<String, CliError> {
+    let licenses = match args.license.is_empty() {
+        true => vec!["mit".to_owned(), "apache-2.0".to_owned()],
+        false => args.license.clone(),
+    };
+    let licenses: String = licenses.iter().map(|l| format!("- {l}\n")).collect();
+    let title: String = args.name.chars().filter(|c| !c.is_control()).collect();
+    let about = match args.checkpoint {
+        None => SHIPPED_CARD.split_once("\n\n").map_or(SHIPPED_CARD, |(_, rest)| rest).to_owned(),
+        Some(_) => {
+            let provenance = serde_json::to_string_pretty(&checkpoint.provenance).map_err(CliError::input)?;
+            format!("## How it was made\n```json\n{provenance}\n```\n")
+        }
+    };
+    Ok(format!(
+        "---\nlicense:\n{licenses}library_name: freerange\npipeline_tag: image-to-3d\ntags:\n- gaussian-splatting\n- 3d\n---\n\n\
+         # {title}\n\n\
+         Makes {} 3D Gaussians of an object from a few posed photos, with the program `freerange`:\n\n\
+         ```sh\nfreerange reconstruct SCENE -o out --checkpoint model.safetensors\n```\n\n{about}",
+        1u64 << checkpoint.depth,
+    ))
+}

@@ -1,0 +1,93 @@
+//! `freerange inspect`
+
+use std::path::PathBuf;
+
+use freerange::{DeviceName, Reconstructor, choose_views, to_canonical};
+use freerange_scene::{
+    inspect::{Inspection, inspect, sheet},
+    write_masks,
+};
+
+use crate::{
+    error::CliError,
+    output::OutputFolder,
+    photos::{Photos, UpChoice},
+};
+
+/// Show what is understood of a scene: cameras, masks, place and size of the object, and what may go wrong.
+///
+/// Writes inspect.png (the cameras from above, and every photo with its mask and the object's sphere), inspect.json, and masks/ (to be
+/// mended and given back with --masks).
+#[derive(clap::Args)]
+pub struct Args {
+    /// Folder of photos with cameras (transforms.json, COLMAP, Polycam, Metashape, RealityCapture), or such a file.
+    scene: PathBuf,
+    /// Where the files go.
+    #[arg(short, long, default_value = "inspect")]
+    output: PathBuf,
+    #[command(flatten)]
+    photos: Photos,
+    /// Which way is up in the scene's frame: z, y, cameras (where the tops of the photos point), a direction X,Y,Z, or auto.
+    #[arg(long, default_value = "auto", allow_hyphen_values = true)]
+    up: UpChoice,
+    /// Views that the model would be shown [default: as `reconstruct`].
+    #[arg(long, value_name = "K", value_parser = clap::value_parser!(u16).range(1..=256))]
+    views: Option<u16>,
+    /// Print what is understood as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), CliError> {
+    let scene = args.photos.load(&args.scene, args.up)?;
+    let views = match args.views {
+        Some(k) => usize::from(k),
+        None => Reconstructor::shipped(&DeviceName::Cpu.open()?)?.views(),
+    };
+    let (frame, _) = to_canonical(&scene.loaded.views, &scene.frame)?;
+    let shown = choose_views(&scene.loaded.views, views)?;
+    let found = inspect(&scene.cameras, &scene.loaded, &frame, &shown);
+    let output = OutputFolder::create("inspect", &args.output)?;
+    output.picture("inspect.png", &sheet(&scene.loaded, &found))?;
+    let json = serde_json::to_string_pretty(&found).map_err(CliError::failure)?;
+    output.write("inspect.json", json.as_bytes())?;
+    write_masks(&output.path("masks")?, &scene.cameras, &scene.loaded)?;
+    output.commit()?;
+    match args.json {
+        true => println!("{json}"),
+        false => print(args, &found),
+    }
+    Ok(())
+}
+
+fn print(args: &Args, found: &Inspection) {
+    let shown = found.views.iter().filter(|v| v.shown).count();
+    println!(
+        "{}: {} cameras, {} photos, {shown} shown to the model",
+        args.scene.display(),
+        found.format.name(),
+        found.views.len()
+    );
+    let [x, y, z] = found.center;
+    println!("  object: middle ({x:.4}, {y:.4}, {z:.4}), radius {:.4}", found.radius);
+    let [x, y, z] = found.up;
+    println!("  up: ({x:.3}, {y:.3}, {z:.3})");
+    for view in &found.views {
+        println!(
+            "  {:24} {} x {}, azimuth {:4.0}, elevation {:3.0}, mask {:4.1} %, agrees {:3.0} %{}{}",
+            view.name,
+            view.width,
+            view.height,
+            view.azimuth,
+            view.elevation,
+            100.0 * view.covers,
+            100.0 * view.agreement,
+            if view.cut_off { ", cut off" } else { "" },
+            if view.shown { "" } else { ", not shown" },
+        );
+    }
+    found.notes.iter().for_each(|note| println!("  note: {note}"));
+    found.warnings.iter().for_each(|warning| println!("  warning: {warning}"));
+    println!("  {}", args.output.join("inspect.png").display());
+}

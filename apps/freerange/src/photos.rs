@@ -1,0 +1,157 @@
+//! Options that say how photos are read, and the scene that comes of them.
+
+use std::{path::Path, str::FromStr};
+
+use freerange::{FrameConfig, Up};
+use freerange_scene::{
+    LoadConfig, Loaded, MaskSource,
+    estimate::{Hints, table_faces},
+    load,
+    read::{Cameras, Format, Turntable, cameras},
+};
+use glam::DVec3;
+
+use crate::error::CliError;
+
+/// How photos are read.
+#[derive(clap::Args)]
+pub struct Photos {
+    /// Whose cameras to read where a folder has several: transforms, colmap, polycam, metashape or realitycapture.
+    #[arg(long, value_name = "FORMAT", value_parser = parse_format)]
+    cameras: Option<Format>,
+    /// The photos have no cameras: they were taken at even steps of one full turn of the object, in order of their names, from this
+    /// elevation and with this field of view across the longer side, in degrees. The object turns counterclockwise as seen from above;
+    /// add `,cw` for the other way.
+    #[arg(long, value_name = "ELEVATION,FOV", conflicts_with = "cameras", allow_hyphen_values = true)]
+    turntable: Option<Turntable>,
+    /// Where the object's masks come from: a folder of them (NAME.png, white is the object), alpha, plain (one colour behind the object),
+    /// or estimate (from poses and colours) [default: the first of these that is there; folders are called masks].
+    #[arg(long, value_name = "WHERE", value_parser = parse_masks)]
+    masks: Option<MaskSource>,
+    /// In mask files black is the object.
+    #[arg(long)]
+    invert_masks: bool,
+    /// Larger photos are made smaller: longer side in pixels.
+    #[arg(long, value_name = "PIXELS", default_value_t = 1024, value_parser = clap::value_parser!(u32).range(64..=16384))]
+    max_side: u32,
+    /// The object's middle in the scene's frame [default: found from masks and cameras].
+    #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true)]
+    center: Option<DVec3>,
+    /// The radius of a sphere about its middle that holds the object [default: found].
+    #[arg(long, value_name = "R")]
+    radius: Option<f64>,
+}
+
+/// Which way is up.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum UpChoice {
+    /// By the cameras' format: z where that is its rule, else what the object stands on, or the cameras.
+    Auto,
+    /// As told.
+    Told(Up),
+}
+
+impl FromStr for UpChoice {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        Ok(match text {
+            "auto" => Self::Auto,
+            "z" => Self::Told(Up::Z),
+            "y" => Self::Told(Up::Y),
+            "cameras" => Self::Told(Up::Cameras),
+            _ => {
+                let direction = parse_point(text).ok().filter(|d| d.length() > 0.0);
+                let direction = direction.ok_or("expected auto, z, y, cameras, or a direction X,Y,Z")?;
+                Self::Told(Up::Direction(direction))
+            }
+        })
+    }
+}
+
+impl UpChoice {
+    /// What it means where nothing else is known.
+    pub fn or_z(self) -> Up {
+        match self {
+            Self::Auto => Up::Z,
+            Self::Told(up) => up,
+        }
+    }
+}
+
+fn parse_format(text: &str) -> Result<Format, String> {
+    let known = Format::ALL.into_iter().find(|f| f.name() == text);
+    known.ok_or_else(|| "expected transforms, colmap, polycam, metashape or realitycapture".into())
+}
+
+fn parse_masks(text: &str) -> Result<MaskSource, String> {
+    Ok(match text {
+        "auto" => MaskSource::Auto,
+        "alpha" => MaskSource::Alpha,
+        "plain" => MaskSource::Plain,
+        "estimate" => MaskSource::Estimate,
+        folder => MaskSource::Files(folder.into()),
+    })
+}
+
+fn parse_point(text: &str) -> Result<DVec3, String> {
+    let numbers: Vec<f64> =
+        text.split(',').filter_map(|p| p.trim().parse().ok()).filter(|v: &f64| v.is_finite()).collect();
+    match (numbers.as_slice(), text.split(',').count()) {
+        (&[x, y, z], 3) => Ok(DVec3::new(x, y, z)),
+        _ => Err("expected three numbers, as in 0.1,0,-2".into()),
+    }
+}
+
+/// A scene as it was read and cut out.
+pub struct Scene {
+    /// What the cameras' program told.
+    pub cameras: Cameras,
+    /// The views.
+    pub loaded: Loaded,
+    /// Where the object is, as far as it was told, and which way is up.
+    pub frame: FrameConfig,
+    /// What was understood, for the user to read.
+    pub notes: Vec<String>,
+}
+
+impl Photos {
+    /// Reads a scene.
+    pub fn load(&self, scene: &Path, up: UpChoice) -> Result<Scene, CliError> {
+        let cameras = cameras(scene, self.cameras, self.turntable.as_ref())?;
+        let config = LoadConfig {
+            masks: self.masks.clone().unwrap_or_default(),
+            invert_masks: self.invert_masks,
+            max_side: self.max_side,
+            hints: Hints { center: self.center, radius: self.radius },
+        };
+        let loaded = load(&cameras, &config)?;
+        let mut notes: Vec<String> = cameras.notes.iter().chain(&loaded.notes).cloned().collect();
+        let up = match (up, cameras.format) {
+            (UpChoice::Told(up), _) => up,
+            (UpChoice::Auto, Format::Colmap | Format::Metashape) => {
+                let table = match &loaded.estimate {
+                    Some(estimate) => estimate.up,
+                    None => table_faces(&loaded.views, &loaded.whole),
+                };
+                let whence = if table.is_some() { "what the object stands on" } else { "the cameras" };
+                notes.push(format!("up is taken from {whence}; --up says otherwise"));
+                table.map_or(Up::Cameras, Up::Direction)
+            }
+            (UpChoice::Auto, _) => Up::Z,
+        };
+        let frame = FrameConfig { up, center: self.center, radius: self.radius, ..FrameConfig::default() };
+        Ok(Scene { cameras, loaded, frame, notes })
+    }
+
+    /// Reads views that are only compared with: all of a scene's.
+    pub fn further(scene: &Path) -> Result<Vec<freerange::View>, CliError> {
+        let loaded = load(&cameras(scene, None, None)?, &LoadConfig::default())?;
+        if loaded.estimate.is_some() {
+            let what =
+                "expected views to compare with that have masks (alpha, files, or a plain background), found none";
+            return Err(CliError::file(scene, what));
+        }
+        Ok(loaded.views.into_iter().chain(loaded.further).collect())
+    }
+}

@@ -1,0 +1,87 @@
+//! `docs/architecture.md` says what a crate must not know. Its manifest is where it would learn of it.
+
+use std::{collections::BTreeMap, fs, path::Path};
+
+/// Each crate, and which of the others it may use. They stand in the road's order: nobody uses what comes later.
+const ROOMS: &[(&str, &[&str])] = &[
+    ("freerange-splat", &[]),
+    ("freerange-camera", &[]),
+    ("freerange-scene", &["freerange-camera"]),
+    ("freerange-formats", &["freerange-splat"]),
+    ("freerange-hub", &[]),
+    ("freerange-raster", &["freerange-camera"]),
+    ("freerange-model", &["freerange-splat"]),
+    ("freerange-metrics", &["freerange-model"]),
+    ("freerange-mesh", &["freerange-camera"]),
+    ("freerange-fit", &["freerange-splat", "freerange-camera", "freerange-raster", "freerange-metrics"]),
+    (
+        "freerange-data",
+        &[
+            "freerange-splat",
+            "freerange-camera",
+            "freerange-raster",
+            "freerange-metrics",
+            "freerange-mesh",
+            "freerange-fit",
+        ],
+    ),
+    (
+        "freerange-flow",
+        &[
+            "freerange-splat",
+            "freerange-camera",
+            "freerange-raster",
+            "freerange-model",
+            "freerange-fit",
+            "freerange-data",
+        ],
+    ),
+    (
+        "freerange",
+        &[
+            "freerange-splat",
+            "freerange-camera",
+            "freerange-raster",
+            "freerange-model",
+            "freerange-metrics",
+            "freerange-fit",
+            "freerange-flow",
+        ],
+    ),
+    ("freerange-eval", &["freerange-splat", "freerange-camera", "freerange-raster", "freerange-metrics"]),
+    ("freerange-cli", &["*"]),
+];
+
+/// Fixes features of shared dependencies; holds no code.
+const FEATURES: &str = "workspace-features";
+
+#[test]
+fn no_room_knows_what_it_must_not() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+    let mut found = BTreeMap::new();
+    for folder in ["crates", "apps"] {
+        for entry in fs::read_dir(root.join(folder)).unwrap() {
+            let Ok(text) = fs::read_to_string(entry.unwrap().path().join("Cargo.toml")) else { continue };
+            let manifest: toml::Table = toml::from_str(&text).unwrap();
+            let name = manifest["package"]["name"].as_str().unwrap().to_owned();
+            let tables = [manifest.get("dependencies"), manifest.get("build-dependencies")];
+            let own = tables.into_iter().flatten().flat_map(|t| t.as_table().unwrap().keys().cloned());
+            found.insert(name, own.filter(|d| d.starts_with("freerange")).collect::<Vec<_>>());
+        }
+    }
+    found.remove(FEATURES);
+    let names: Vec<&str> = ROOMS.iter().map(|(name, _)| *name).collect();
+    let mut listed: Vec<&str> = names.clone();
+    listed.sort_unstable();
+    assert_eq!(found.keys().map(String::as_str).collect::<Vec<_>>(), listed, "every crate has its place on the road");
+    for (place, (name, allowed)) in ROOMS.iter().enumerate() {
+        for used in &found[*name] {
+            assert!(allowed.contains(&"*") || allowed.contains(&used.as_str()), "{name} must not know {used}");
+            assert!(names[..place].contains(&used.as_str()), "{name} comes before {used}");
+        }
+    }
+    let text = fs::read_to_string(root.join("docs/architecture.md")).unwrap();
+    for name in names {
+        assert!(text.contains(&format!("`{name}`")), "docs/architecture.md says what {name} is");
+    }
+}

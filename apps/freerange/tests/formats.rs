@@ -1,0 +1,202 @@
+//! File formats through the real binary.
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    process::{Command, Output},
+};
+
+use freerange_formats::{Frame, read};
+use freerange_splat::{Cloud, channel, write_ply};
+use glam::DVec3;
+
+fn freerange(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_freerange")).args(args).output().unwrap()
+}
+
+fn example() -> String {
+    concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/bowl").to_owned()
+}
+
+/// Ten Gaussians on a curve without symmetry, as a file in a folder of its own.
+fn object() -> (tempfile::TempDir, PathBuf, Cloud) {
+    let folder = tempfile::tempdir().unwrap();
+    let mut cloud = Cloud::default();
+    for i in 0..10 {
+        let t = i as f32 / 10.0;
+        let mut row = [0.0; channel::COUNT];
+        row[channel::MEAN].copy_from_slice(&[0.4 * t, 0.3 * t * t, 0.1 - 0.2 * t]);
+        row[channel::LOG_SCALE].copy_from_slice(&[-4.0, -3.5, -3.0]);
+        row[channel::ROTATION].copy_from_slice(&[0.8, 0.6, 0.0, 0.0]);
+        row[channel::COLOR].copy_from_slice(&[t, 1.0 - t, 0.5]);
+        cloud.push(&row);
+    }
+    let path = folder.path().join("object.ply");
+    write_ply(&cloud, &path).unwrap();
+    (folder, path, cloud)
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+#[test]
+fn convert_goes_to_every_format_and_back() {
+    let (folder, source, cloud) = object();
+    for extension in ["ply", "spz", "sog", "glb", "html"] {
+        let (there, back) = (folder.path().join(format!("there.{extension}")), folder.path().join("back.ply"));
+        for (from, to) in [(&source, &there), (&there, &back)] {
+            let done = freerange(&["convert", text(from), text(to), "--frame", "y-down"]);
+            assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+            assert!(String::from_utf8_lossy(&done.stdout).contains("10 Gaussians"));
+        }
+        let found = read(&back, Frame::Y_DOWN).unwrap().cloud;
+        for i in 0..10 {
+            assert!((found.mean(i) - cloud.mean(i)).length() < 1e-4, "{extension}");
+            assert!(found.covariance(i).abs_diff_eq(cloud.covariance(i), 2e-4), "{extension}");
+        }
+    }
+    // From a frame into another.
+    let turned = folder.path().join("turned.ply");
+    assert!(freerange(&["convert", text(&source), text(&turned), "--frame", "y-down:z-up"]).status.success());
+    let found = read(&turned, Frame::Z_UP).unwrap().cloud;
+    let expected = |m: DVec3| DVec3::new(m.x, m.z, -m.y);
+    assert!((0..10).all(|i| (found.mean(i) - expected(cloud.mean(i))).length() < 1e-6));
+}
+
+#[test]
+fn what_cannot_be_converted_is_refused() {
+    let (folder, source, _) = object();
+    let output = folder.path().join("out.spz");
+    let refused = |input: &Path, output: &Path, extra: &[&str], words: &[&str]| {
+        let done = freerange(&[&["convert", text(input), text(output)], extra].concat());
+        let message = String::from_utf8_lossy(&done.stderr).into_owned();
+        assert_eq!(done.status.code(), Some(2), "{message}");
+        words.iter().for_each(|w| assert!(message.contains(w), "expected {w:?} in: {message}"));
+        assert!(!message.contains("panicked") && !output.exists());
+    };
+    refused(&source, &folder.path().join("out.usdz"), &[], &["out.usdz", ".spz", "found .usdz"]);
+    refused(&folder.path().join("missing.glb"), &output, &[], &["missing.glb", "No such file"]);
+    refused(&source, &output, &["--frame", "x-up"], &["expected z-up, y-up or y-down"]);
+    for extension in ["ply", "splat", "spz", "sog", "glb", "html"] {
+        let broken = folder.path().join(format!("broken.{extension}"));
+        fs::write(&broken, "nothing of the kind").unwrap();
+        refused(&broken, &output, &[], &[&format!("broken.{extension}"), "expected", "found"]);
+    }
+    let empty = folder.path().join("empty.splat");
+    fs::write(&empty, "").unwrap();
+    refused(&empty, &output, &[], &["at least one Gaussian"]);
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 8);
+}
+
+#[test]
+fn reconstruct_writes_the_formats_asked_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let output = folder.path().join("result");
+    let scene = example();
+    let done = freerange(&[
+        "reconstruct",
+        &scene,
+        "-o",
+        text(&output),
+        "--steps",
+        "1",
+        "--refine",
+        "0",
+        "--format",
+        "glb,spz,html,ply",
+    ]);
+    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    let cloud = read(&output.join("gaussians.ply"), Frame::Z_UP).unwrap().cloud;
+    for name in ["gaussians.glb", "gaussians.spz", "view.html"] {
+        let found = read(&output.join(name), Frame::Z_UP).unwrap().cloud;
+        let apart = (0..cloud.len()).map(|i| (found.mean(i) - cloud.mean(i)).length()).fold(0.0, f64::max);
+        assert!(found.len() == cloud.len() && apart < 1e-4, "{name}: {apart}");
+    }
+    // All formats can be rendered.
+    let renders = folder.path().join("renders");
+    let cameras = format!("{scene}/transforms_test.json");
+    let done = freerange(&["render", text(&output.join("gaussians.glb")), "--cameras", &cameras, "-o", text(&renders)]);
+    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    assert!(fs::read_dir(renders).unwrap().count() > 1);
+    let done = freerange(&["reconstruct", &scene, "-o", text(&output), "--format", "usdz"]);
+    assert_eq!(done.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&done.stderr).contains("expected one of ply, splat, spz, sog, glb, html"));
+}
+
+#[test]
+fn a_model_is_exported_with_its_card() {
+    let folder = tempfile::tempdir().unwrap();
+    let model = folder.path().join("model");
+    let done = freerange(&["model", "export", text(&model)]);
+    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    let card = fs::read_to_string(model.join("README.md")).unwrap();
+    let head = card.strip_prefix("---\n").unwrap().split_once("\n---\n").unwrap().0;
+    for line in ["license:\n- mit\n- apache-2.0", "library_name: freerange", "pipeline_tag: image-to-3d"] {
+        assert!(head.contains(line), "{head}");
+    }
+    assert!(card.contains("19,113,016 parameters") && card.contains("1024 3D Gaussians"));
+    let config: serde_json::Value = serde_json::from_slice(&fs::read(model.join("config.json")).unwrap()).unwrap();
+    assert_eq!((&config["model_type"], &config["gaussians"]), (&"free-range".into(), &1024.into()));
+    // The weights are those of the checkpoint, and exporting them again says where they came from.
+    let weights = model.join("model.safetensors");
+    let again = folder.path().join("again");
+    let done = freerange(&["model", "export", text(&again), "--checkpoint", text(&weights)]);
+    assert_eq!(done.status.code(), Some(2), "a licence is not ours to choose");
+    let license = ["--license", "cc-by-4.0"];
+    let args = [&["model", "export", text(&again), "--checkpoint", text(&weights)], &license[..]].concat();
+    assert!(freerange(&args).status.success());
+    assert_eq!(fs::read(&weights).unwrap(), fs::read(again.join("model.safetensors")).unwrap());
+    assert!(fs::read_to_string(again.join("README.md")).unwrap().contains("license:\n- cc-by-4.0\n"));
+    let args =
+        [&["model", "export", text(&again), "--checkpoint", text(&weights)], &["--license", "a\nb"][..]].concat();
+    assert_eq!(freerange(&args).status.code(), Some(2));
+    fs::write(&weights, b"no weights").unwrap();
+    let other = folder.path().join("other");
+    let args = [&["model", "export", text(&other), "--checkpoint", text(&weights)], &license[..]].concat();
+    let done = freerange(&args);
+    assert!(done.status.code() == Some(2) && !other.exists());
+    assert!(String::from_utf8_lossy(&done.stderr).contains("model.safetensors"));
+}
+
+#[test]
+fn a_model_on_the_hub_is_taken_from_the_cache() {
+    let cache = tempfile::tempdir().unwrap();
+    let run = |args: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_freerange"));
+        command
+            .args(args)
+            .env("XDG_CACHE_HOME", cache.path())
+            .env("HOME", cache.path())
+            .env("LOCALAPPDATA", cache.path());
+        command.output().unwrap()
+    };
+    let refused = |name: &str, words: &[&str]| {
+        let done = run(&["reconstruct", &example(), "-o", text(&cache.path().join("out")), "--checkpoint", name]);
+        let message = String::from_utf8_lossy(&done.stderr).into_owned();
+        assert_eq!(done.status.code(), Some(2), "{message}");
+        words.iter().for_each(|w| assert!(message.contains(w), "expected {w:?} in: {message}"));
+    };
+    refused("hf:../model", &["hf:owner/name[@revision]", "found \"hf:../model\""]);
+    #[cfg(target_os = "linux")]
+    {
+        use sha2::{Digest, Sha256};
+        let commit = "0123456789abcdef0123456789abcdef01234567";
+        let place = cache.path().join("freerange/hub/a/b");
+        let folder = place.join(commit);
+        assert!(run(&["model", "export", text(&folder)]).status.success());
+        let weights = fs::read(folder.join("model.safetensors")).unwrap();
+        let hash: String = Sha256::digest(&weights).iter().map(|b| format!("{b:02x}")).collect();
+        fs::write(folder.join("pins.json"), format!("{{\"sha256\":{{\"model.safetensors\":\"{hash}\"}}}}")).unwrap();
+        fs::create_dir_all(place.join("refs")).unwrap();
+        fs::write(place.join("refs/main"), commit).unwrap();
+        for name in ["hf:a/b", &format!("hf:a/b@{commit}")] {
+            let done = run(&["model", "info", name]);
+            assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+        }
+        fs::write(place.join("refs/main"), "main").unwrap();
+        refused("hf:a/b", &["refs/main", "40 hexadecimal digits"]);
+        #[cfg(not(feature = "fetch"))]
+        refused("hf:a/c", &["hf:a/c@main", "model.safetensors", "--features fetch"]);
+    }
+}

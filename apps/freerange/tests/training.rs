@@ -1,0 +1,112 @@
+//! `freerange train` is killed again and again, and nothing comes of it.
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    process::{Child, Command, Stdio},
+    thread,
+    time::{Duration, Instant},
+};
+
+/// The smallest model, with objects that come and go and threads that make them.
+const CONFIG: &str = r#"
+seed = 5
+model = { image_size = 16, hidden = 16, blocks = 1, heads = 2, registers = 2, gaussians_per_token = 4, time_features = 8, encoder = { kind = "patch", patch_size = 8, channels = 4 } }
+loss = { held_views = 1, input_views = [2, 2], render_size = 16, gradient_size = 16 }
+validation = { every = 5, objects = 1 }
+stage = [
+    { depth = 3, image_size = 16, batch = 2, steps = 30 },
+    { depth = 4, image_size = 16, batch = 3, micro_batch = 2, steps = 60 },
+]
+
+[sample]
+steps = 1
+guidance = 1.0
+gradient_size = 16
+
+[data]
+window = 5
+fresh = 2
+workers = 2
+statistics_objects = 2
+
+[data.object]
+views = 4
+samples_per_axis = 1
+
+[data.object.cameras]
+resolution = 16
+
+[data.object.surface]
+points = 64
+"#;
+
+/// Steps between states, and steps in all.
+const SAVE_EVERY: u64 = 4;
+const STEPS: u64 = 90;
+const KILLS: u64 = 10;
+
+fn train(config: &Path, run: &Path) -> Child {
+    Command::new(env!("CARGO_BIN_EXE_freerange"))
+        .args(["train".as_ref(), config.as_os_str(), "-o".as_ref(), run.as_os_str()])
+        .args(["--save-every", &SAVE_EVERY.to_string()])
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap()
+}
+
+/// The step of the latest state in a run's folder.
+fn saved(run: &Path) -> u64 {
+    let names = fs::read_dir(run).into_iter().flatten().flatten().map(|e| e.file_name());
+    names.filter_map(|n| n.to_str()?.strip_prefix("state-")?.parse().ok()).max().unwrap_or(0)
+}
+
+/// What a run has learned and said: weights, and the log without times.
+fn outcome(run: &Path) -> (Vec<u8>, Vec<u8>, Vec<serde_json::Value>) {
+    // The header has the time that training took.
+    let weights = |name: &str| {
+        let bytes = fs::read(run.join(name)).unwrap();
+        let header = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+        bytes[8 + header..].to_vec()
+    };
+    let log = fs::read_to_string(run.join("log.jsonl")).unwrap();
+    let lines = log.lines().map(|line| {
+        let mut line: serde_json::Value = serde_json::from_str(line).unwrap();
+        let fields = line.as_object_mut().unwrap();
+        ["seconds", "data_seconds"].iter().for_each(|field| drop(fields.remove(*field)));
+        line
+    });
+    (weights("checkpoint.safetensors"), weights("best.safetensors"), lines.collect())
+}
+
+#[test]
+fn killed_at_ten_points_it_learns_what_it_would_have() {
+    let place = tempfile::tempdir().unwrap();
+    let path = |name: &str| -> PathBuf { place.path().join(name) };
+    fs::write(path("config.toml"), CONFIG).unwrap();
+    assert!(train(&path("config.toml"), &path("whole")).wait().unwrap().success());
+    assert_eq!(saved(&path("whole")), STEPS);
+
+    let run = path("killed");
+    for kill in 1..=KILLS {
+        let mut child = train(&path("config.toml"), &run);
+        let begin = Instant::now();
+        // After another state, and then at once, or while it steps or writes the next.
+        while saved(&run) < kill * SAVE_EVERY {
+            assert!(child.try_wait().unwrap().is_none(), "it ended before it was killed");
+            assert!(begin.elapsed() < Duration::from_secs(300), "it makes no progress");
+            thread::sleep(Duration::from_millis(1));
+        }
+        thread::sleep(Duration::from_millis(3 * (kill - 1)));
+        child.kill().unwrap();
+        assert!(!child.wait().unwrap().success());
+    }
+    let reached = saved(&run);
+    assert!((KILLS * SAVE_EVERY..STEPS).contains(&reached), "killed for the last time at step {reached}");
+    assert!(train(&path("config.toml"), &run).wait().unwrap().success());
+    let (expected, found) = (outcome(&path("whole")), outcome(&run));
+    assert!(expected.0 == found.0 && expected.1 == found.1, "other weights");
+    assert_eq!(expected.2, found.2);
+    assert_eq!(found.2.len() as u64, STEPS + STEPS / 5);
+}

@@ -1,0 +1,137 @@
+//! How good the averaged weights are on objects that training does not see: now and then, always in the same way.
+
+use std::{ops::ControlFlow, sync::Arc};
+
+use burn::tensor::{Device, Tensor};
+use freerange_camera::View;
+use freerange_data::{Object, ObjectSource, psnr_over_white};
+use freerange_model::{Checkpoint, FreeRange, ModelConfig};
+use freerange_splat::{Cloud, channel};
+
+use crate::{
+    FlowError,
+    batch::{Batch, choose_views, step_rng},
+    config::{Stage, TrainConfig},
+    photometric::Photometric,
+    sample::{SampleConfig, reconstruct},
+    train,
+};
+
+/// Measuring while training.
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ValidationConfig {
+    /// Steps from one measurement to the next; 0: none.
+    pub every: u64,
+    /// So many objects: of the shards' validation split, or generated from seeds of their own.
+    pub objects: usize,
+}
+
+impl Default for ValidationConfig {
+    fn default() -> Self {
+        Self { every: 0, objects: 8 }
+    }
+}
+
+/// What was measured.
+#[derive(Clone, Debug, PartialEq, serde::Serialize)]
+pub struct Figures {
+    /// Flow-matching loss.
+    pub flow: f32,
+    /// L1 over input views.
+    pub seen: f32,
+    /// L1 over other views.
+    pub held: f32,
+    /// Mean PSNR, in dB over white, of other views of what the model samples.
+    pub psnr: f64,
+    /// Samples that is the mean of.
+    pub samples: usize,
+}
+
+/// The objects to measure on.
+#[derive(Debug)]
+pub(crate) struct Validation {
+    objects: Vec<Arc<Object>>,
+    seed: u64,
+}
+
+/// Views of an object that samples are compared with, at most.
+const COMPARED: usize = 8;
+
+impl Validation {
+    /// Takes the first `count` of `available` objects of `source`.
+    pub fn new(source: &dyn ObjectSource, available: u64, count: usize, seed: u64) -> Result<Self, FlowError> {
+        let count = (count as u64).min(available);
+        let objects = (0..count).map(|i| Ok(Arc::new(source.object(i)?))).collect::<Result<_, FlowError>>()?;
+        Ok(Self { objects, seed })
+    }
+
+    /// Measures `checkpoint`, whose weights are also in `tracked`, a model on a differentiating device.
+    pub fn measure(
+        &self,
+        checkpoint: &Checkpoint,
+        tracked: &FreeRange,
+        config: &TrainConfig,
+        stage: &Stage,
+        device: &Device,
+    ) -> Result<Figures, FlowError> {
+        let photometric = Photometric::new(&checkpoint.normalization, device);
+        let rms = Tensor::<1>::from_floats(checkpoint.gradient_rms, device).reshape([1, 1, channel::COUNT]);
+        let model_config = ModelConfig { image_size: stage.image_size, ..config.model.clone() };
+        let mut sums = [0.0; 3];
+        let (mut sum, mut samples) = (0.0, 0);
+        for (number, object) in self.objects.iter().enumerate() {
+            // Times, noise and views are the same every time.
+            let mut rng = step_rng(self.seed, number as u64);
+            let one = std::slice::from_ref(object);
+            let batch =
+                Batch::draw(one, stage, &model_config, &config.loss, &checkpoint.normalization, &mut rng, device)?;
+            let losses = train::step(tracked, batch, &photometric, &rms, &config.loss, device)?;
+            let figures = Tensor::cat(vec![losses.flow, losses.seen, losses.held], 0).into_data();
+            let figures = figures.try_to_vec::<f32>().map_err(|_| FlowError::NoGradient)?;
+            sums.iter_mut().zip(figures).for_each(|(sum, x)| *sum += x);
+
+            for (inputs, others, fit) in self.tasks(object, config, number) {
+                // The size that objects come in is the size that they are sampled and compared at.
+                let sample = SampleConfig { depth: Some(stage.depth), ..config.sample.clone() };
+                let fits = fit.map(|fit| [fit]);
+                let fits = fits.as_ref().map(<[Cloud; 1]>::as_slice);
+                let found = reconstruct(checkpoint, &[&inputs], fits, &sample, &[self.seed], device, |_| {
+                    ControlFlow::Continue(())
+                })?;
+                sum += psnr_over_white(&found[0][0], &others)?;
+                samples += 1;
+            }
+        }
+        let mean = |x: f32| x / self.objects.len() as f32;
+        let [flow, seen, held] = sums.map(mean);
+        Ok(Figures { flow, seen, held, psnr: sum / samples as f64, samples })
+    }
+
+    /// Input views, views to compare with, and the fit to start from: each of the object's fits where sampling starts from
+    /// one, else one choice of views.
+    fn tasks(
+        &self,
+        object: &Object,
+        config: &TrainConfig,
+        number: usize,
+    ) -> Vec<(Vec<View>, Vec<View>, Option<Cloud>)> {
+        let (fewest, most) = config.loss.input_views;
+        let of = |(chosen, rest): (Vec<&View>, Vec<&View>), fit| {
+            let views = |views: Vec<&View>| views.into_iter().cloned().collect::<Vec<View>>();
+            (views(chosen), views(rest.into_iter().take(COMPARED).collect()), fit)
+        };
+        if config.sample.start.is_none() {
+            let mut rng = step_rng(!self.seed, number as u64);
+            let count = 4usize.clamp(fewest, most);
+            return vec![of(choose_views(&object.views, count, false, &mut rng), None)];
+        }
+        let fits = object.input_fits.iter().take(2); // around the object, and from one side
+        fits.map(|fit| {
+            let (chosen, rest) = (0..object.views.len()).partition::<Vec<usize>, _>(|i| fit.views.contains(i));
+            let [chosen, rest] = [chosen, rest].map(|set| set.into_iter().map(|i| &object.views[i]).collect());
+            of((chosen, rest), Some(fit.gaussians.clone()))
+        })
+        .collect()
+    }
+}

@@ -1,0 +1,15 @@
+//! Photos in: the cameras of other programs, lenses, masks of the object, and what was understood of it all.
+//!
+//! [`read::cameras`] finds out what a folder is and reads the cameras; [`load`] makes views of the photos, undistorted and
+//! cut out.
+
+#![deny(missing_docs)]
+
+mod error;
+pub mod estimate;
+pub mod inspect;
+mod load;
+pub mod read;
+
+pub use error::SceneError;
+pub use load::{LoadConfig, Loaded, MaskKind, MaskSource, load, write_masks};

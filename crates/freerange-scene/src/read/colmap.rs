@@ -1,0 +1,355 @@
+//! COLMAP's sparse models: `cameras` and `images`, binary or text.
+//!
+//! Written after the format's documentation; points, rigs and frames are not read. Poses are world to camera with OpenCV's axes,
+//! pixel centres lie at +0.5, numbers in binary files are little-endian.
+
+use super::{Cameras, Format, Intrinsics, Photo, bytes_of, coefficients, find_image, pinhole, rigid, text_of};
+use crate::{SceneError, error::In};
+use freerange_camera::Lens;
+use glam::{DMat3, DQuat, DVec3};
+use std::{
+    collections::{HashMap, HashSet},
+    path::{Path, PathBuf},
+};
+
+/// Names of COLMAP's camera models in the order of their numbers.
+const MODELS: [&str; 18] = [
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "OPENCV_FISHEYE",
+    "FULL_OPENCV",
+    "FOV",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+    "THIN_PRISM_FISHEYE",
+    "RAD_TAN_THIN_PRISM_FISHEYE",
+    "SIMPLE_DIVISION",
+    "DIVISION",
+    "SIMPLE_FISHEYE",
+    "FISHEYE",
+    "EUCM",
+    "EQUIRECTANGULAR",
+];
+const ADVICE: &str = "undistort the images first (colmap image_undistorter)";
+
+/// A camera: size, focal lengths, principal point, lens.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ColmapCamera {
+    /// Width and height in pixels.
+    pub size: (u64, u64),
+    /// Focal lengths, x and y, in pixels.
+    pub focal: [f64; 2],
+    /// Principal point in pixels.
+    pub principal: [f64; 2],
+    /// Its lens.
+    pub lens: Lens,
+}
+
+/// A posed image.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ColmapImage {
+    /// Unit quaternion of the rotation from world to camera.
+    pub rotation: DQuat,
+    /// Translation from world to camera.
+    pub translation: DVec3,
+    /// Number of its camera.
+    pub camera: u32,
+    /// Path of the image, relative to the folder of images.
+    pub name: String,
+}
+
+/// How many parameters the models have that are read; none for the others.
+fn parameter_count(model: &str) -> Option<usize> {
+    Some(match model {
+        "SIMPLE_PINHOLE" => 3,
+        "PINHOLE" | "SIMPLE_RADIAL" => 4,
+        "RADIAL" => 5,
+        "OPENCV" | "OPENCV_FISHEYE" => 8,
+        "FULL_OPENCV" => 12,
+        _ => return None,
+    })
+}
+
+fn camera(file: &Path, place: &str, model: &str, size: (u64, u64), p: &[f64]) -> Result<ColmapCamera, SceneError> {
+    let expected = parameter_count(model).ok_or_else(|| match MODELS.contains(&model) {
+        true => In(file).unsupported(place, format!("the camera model {model}"), ADVICE),
+        false => In(file).field(place, "model", "the name of a camera model", format!("{model:?}")),
+    })?;
+    if p.len() != expected {
+        return Err(In(file).field(place, "params", &format!("{expected} numbers for {model}"), p.len()));
+    }
+    let (focal, c) = match model {
+        "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL" => ([p[0], p[0]], 1),
+        _ => ([p[0], p[1]], 2),
+    };
+    let k = &p[c + 2..];
+    coefficients(file, place, &["k1", "k2 or k1", "p1", "p2", "k3", "k4", "k5", "k6"], k)?;
+    let lens = match (model, k) {
+        ("SIMPLE_RADIAL", &[k1]) => Lens::brown([k1, 0.0, 0.0, 0.0], [0.0; 2]),
+        ("RADIAL", &[k1, k2]) => Lens::brown([k1, k2, 0.0, 0.0], [0.0; 2]),
+        ("OPENCV", &[k1, k2, p1, p2]) => Lens::brown([k1, k2, 0.0, 0.0], [p1, p2]),
+        ("OPENCV_FISHEYE", &[k1, k2, k3, k4]) => Lens::Fisheye { k: [k1, k2, k3, k4] },
+        ("FULL_OPENCV", &[k1, k2, p1, p2, k3, d1, d2, d3]) => {
+            Lens::Brown { k: [k1, k2, k3, 0.0], d: [d1, d2, d3], p: [p1, p2] }
+        }
+        _ => Lens::Ideal,
+    };
+    Ok(ColmapCamera { size, focal, principal: [p[c], p[c + 1]], lens })
+}
+
+fn image(
+    file: &Path,
+    place: &str,
+    q: [f64; 4],
+    t: [f64; 3],
+    camera: u32,
+    name: String,
+) -> Result<ColmapImage, SceneError> {
+    let [w, x, y, z] = q;
+    let rotation = DQuat::from_xyzw(x, y, z, w);
+    let length = rotation.length();
+    if !(0.99..=1.01).contains(&length) {
+        return Err(In(file).field(place, "QW QX QY QZ", "a unit quaternion", format!("{q:?}")));
+    }
+    if name.is_empty() {
+        return Err(In(file).field(place, "NAME", "a file name", "nothing"));
+    }
+    Ok(ColmapImage { rotation: rotation.normalize(), translation: DVec3::from_array(t), camera, name })
+}
+
+/// What is left of a binary file.
+struct Bytes<'a> {
+    file: &'a Path,
+    all: &'a [u8],
+    at: usize,
+}
+
+impl<'a> Bytes<'a> {
+    fn take(&mut self, count: u64, place: &str) -> Result<&'a [u8], SceneError> {
+        let left = self.all.len() - self.at;
+        if count > left as u64 {
+            let what = format!("expected {count} more bytes at byte {}, found {left}", self.at);
+            return Err(In(self.file).malformed(place, what));
+        }
+        let slice = &self.all[self.at..self.at + count as usize];
+        self.at += count as usize;
+        Ok(slice)
+    }
+
+    fn array<const N: usize>(&mut self, place: &str) -> Result<[u8; N], SceneError> {
+        let mut out = [0; N];
+        out.copy_from_slice(self.take(N as u64, place)?);
+        Ok(out)
+    }
+
+    fn u32(&mut self, place: &str) -> Result<u32, SceneError> {
+        Ok(u32::from_le_bytes(self.array(place)?))
+    }
+
+    fn u64(&mut self, place: &str) -> Result<u64, SceneError> {
+        Ok(u64::from_le_bytes(self.array(place)?))
+    }
+
+    fn f64s<const N: usize>(&mut self, place: &str) -> Result<[f64; N], SceneError> {
+        let mut out = [0.0; N];
+        for v in &mut out {
+            *v = f64::from_le_bytes(self.array(place)?);
+        }
+        Ok(out)
+    }
+
+    fn text(&mut self, place: &str) -> Result<String, SceneError> {
+        let rest = &self.all[self.at..];
+        let end = rest.iter().take(4096).position(|b| *b == 0);
+        let end = end.ok_or_else(|| In(self.file).malformed(place, "a name without an end"))?;
+        self.at += end + 1;
+        let text = std::str::from_utf8(&rest[..end]);
+        text.map(str::to_owned).map_err(|_| In(self.file).malformed(place, "a name that is not UTF-8"))
+    }
+
+    fn end(&self) -> Result<(), SceneError> {
+        match self.all.len() - self.at {
+            0 => Ok(()),
+            left => Err(In(self.file).malformed("", format!("{left} bytes after the last entry"))),
+        }
+    }
+}
+
+/// Reads `cameras.bin`: cameras by number.
+pub fn cameras_binary(file: &Path, bytes: &[u8]) -> Result<HashMap<u32, ColmapCamera>, SceneError> {
+    let mut bytes = Bytes { file, all: bytes, at: 0 };
+    let count = bytes.u64("number of cameras")?;
+    let mut cameras = HashMap::new();
+    for i in 0..count {
+        let place = format!("camera {i}");
+        let (id, model) = (bytes.u32(&place)?, bytes.u32(&place)?);
+        let size = (bytes.u64(&place)?, bytes.u64(&place)?);
+        let model = *MODELS
+            .get(model as usize)
+            .ok_or_else(|| In(file).field(&place, "model", "the number of a camera model, 0 to 17", model))?;
+        let mut parameters = Vec::new();
+        for _ in 0..parameter_count(model).unwrap_or(0) {
+            parameters.extend(bytes.f64s::<1>(&place)?);
+        }
+        if cameras.insert(id, camera(file, &place, model, size, &parameters)?).is_some() {
+            return Err(In(file).field(&place, "CAMERA_ID", "a number of its own", id));
+        }
+    }
+    bytes.end()?;
+    Ok(cameras)
+}
+
+/// Reads `images.bin`.
+pub fn images_binary(file: &Path, bytes: &[u8]) -> Result<Vec<ColmapImage>, SceneError> {
+    let mut bytes = Bytes { file, all: bytes, at: 0 };
+    let count = bytes.u64("number of images")?;
+    let mut images = Vec::new();
+    for i in 0..count {
+        let place = format!("image {i}");
+        bytes.u32(&place)?;
+        let (q, t) = (bytes.f64s(&place)?, bytes.f64s(&place)?);
+        let camera = bytes.u32(&place)?;
+        let name = bytes.text(&place)?;
+        images.push(image(file, &place, q, t, camera, name)?);
+        let keypoints = bytes.u64(&place)?;
+        // x, y and the number of a point: 24 bytes each.
+        bytes.take(keypoints.saturating_mul(24), &format!("{place}, its {keypoints} keypoints"))?;
+    }
+    bytes.end()?;
+    Ok(images)
+}
+
+fn number<T: std::str::FromStr>(file: &Path, place: &str, field: &str, word: Option<&str>) -> Result<T, SceneError> {
+    let found = word.unwrap_or("nothing");
+    word.and_then(|w| w.parse().ok()).ok_or_else(|| In(file).field(place, field, "a number", found))
+}
+
+/// Reads `cameras.txt`: cameras by number.
+pub fn cameras_text(file: &Path, bytes: &[u8]) -> Result<HashMap<u32, ColmapCamera>, SceneError> {
+    let mut cameras = HashMap::new();
+    for (i, line) in text_of(file, bytes)?.lines().enumerate() {
+        let place = format!("line {}", i + 1);
+        let line = line.trim();
+        if line.is_empty() || line.starts_with('#') {
+            continue;
+        }
+        let mut words = line.split_ascii_whitespace();
+        let id = number(file, &place, "CAMERA_ID", words.next())?;
+        let model = words.next().unwrap_or("");
+        let size = (number(file, &place, "WIDTH", words.next())?, number(file, &place, "HEIGHT", words.next())?);
+        let parameters =
+            words.map(|w| number(file, &place, "PARAMS", Some(w))).collect::<Result<Vec<f64>, SceneError>>()?;
+        if cameras.insert(id, camera(file, &place, model, size, &parameters)?).is_some() {
+            return Err(In(file).field(&place, "CAMERA_ID", "a number of its own", id));
+        }
+    }
+    Ok(cameras)
+}
+
+/// Reads `images.txt`: two lines for each image, the second (keypoints, maybe empty) passed over.
+pub fn images_text(file: &Path, bytes: &[u8]) -> Result<Vec<ColmapImage>, SceneError> {
+    let mut images = Vec::new();
+    let mut lines = text_of(file, bytes)?.lines().enumerate();
+    while let Some((i, line)) = lines.next() {
+        let place = format!("line {}", i + 1);
+        let line = line.trim();
+        if line.is_empty() || line.starts_with('#') {
+            continue;
+        }
+        let mut rest = line;
+        let mut word = || {
+            let (word, tail) = rest.trim_start().split_once(char::is_whitespace).unwrap_or((rest.trim_start(), ""));
+            rest = tail;
+            (!word.is_empty()).then_some(word)
+        };
+        number::<u32>(file, &place, "IMAGE_ID", word())?;
+        let (mut q, mut t) = ([0.0; 4], [0.0; 3]);
+        for (v, name) in q.iter_mut().zip(["QW", "QX", "QY", "QZ"]) {
+            *v = number(file, &place, name, word())?;
+        }
+        for (v, name) in t.iter_mut().zip(["TX", "TY", "TZ"]) {
+            *v = number(file, &place, name, word())?;
+        }
+        let camera = number(file, &place, "CAMERA_ID", word())?;
+        // The rest of the line: names may contain spaces.
+        images.push(image(file, &place, q, t, camera, rest.trim().to_owned())?);
+        lines.next();
+    }
+    Ok(images)
+}
+
+/// Both files of a model in `folder`, binary before text.
+fn files(folder: &Path) -> Option<[PathBuf; 2]> {
+    ["bin", "txt"]
+        .map(|extension| ["cameras", "images"].map(|name| folder.join(format!("{name}.{extension}"))))
+        .into_iter()
+        .find(|files| files.iter().all(|f| f.is_file()))
+}
+
+/// The folder of the model that belongs to a scene: `sparse/0`, `sparse`, or the scene itself. Several numbered models are an
+/// error, as COLMAP writes one for each group of photos that it could connect.
+pub(super) fn look_for(scene: &Path) -> Result<Option<PathBuf>, SceneError> {
+    let sparse = scene.join("sparse");
+    let mut numbered = Vec::new();
+    for folder in [&sparse, &scene.to_path_buf()].into_iter().filter(|f| f.is_dir()) {
+        let number =
+            |p: &PathBuf| p.file_name().is_some_and(|n| n.to_string_lossy().bytes().all(|b| b.is_ascii_digit()));
+        numbered.extend(super::entries(folder)?.into_iter().filter(|p| number(p) && files(p).is_some()));
+    }
+    if let [first, second, ..] = numbered.as_slice() {
+        return Err(SceneError::Ambiguous {
+            folder: scene.into(),
+            first: first.display().to_string(),
+            second: second.display().to_string(),
+            advice: "COLMAP found separate groups of photos; name one of these folders instead".into(),
+        });
+    }
+    Ok(numbered.into_iter().chain([sparse, scene.to_path_buf()]).find(|folder| files(folder).is_some()))
+}
+
+/// Reads the model in `folder`. Images are looked for in `images` beside it or up to two folders above, else right there.
+pub(super) fn read(folder: &Path) -> Result<Cameras, SceneError> {
+    let [cameras_file, images_file] = files(folder).ok_or_else(|| {
+        In(folder).malformed("", "expected cameras.bin and images.bin, or cameras.txt and images.txt, in this folder")
+    })?;
+    let binary = super::has_extension(&cameras_file, &["bin"]);
+    let (camera_bytes, image_bytes) = (bytes_of(&cameras_file)?, bytes_of(&images_file)?);
+    let (cameras, mut images) = match binary {
+        true => (cameras_binary(&cameras_file, &camera_bytes)?, images_binary(&images_file, &image_bytes)?),
+        false => (cameras_text(&cameras_file, &camera_bytes)?, images_text(&images_file, &image_bytes)?),
+    };
+    images.sort_by(|a, b| a.name.cmp(&b.name));
+    let absolute = std::fs::canonicalize(folder).map_err(|e| In(folder).read(e))?;
+    let above: Vec<&Path> = absolute.ancestors().take(3).collect();
+    let mut folders: Vec<PathBuf> = above.iter().map(|f| f.join("images")).filter(|f| f.is_dir()).collect();
+    folders.extend(above.iter().map(|f| f.to_path_buf()));
+    let mut names = HashSet::new();
+    let photos = images
+        .into_iter()
+        .map(|i| {
+            let place = format!("image {:?}", i.name);
+            let camera = cameras
+                .get(&i.camera)
+                .ok_or_else(|| In(&images_file).field(&place, "CAMERA_ID", "a camera of the cameras file", i.camera))?;
+            if !names.insert(i.name.clone()) {
+                return Err(In(&images_file).field(&place, "NAME", "a name of its own", "another image with it"));
+            }
+            let rotation = DMat3::from_quat(i.rotation);
+            let centre = -(rotation.transpose() * i.translation);
+            let pose = rigid(&images_file, &place, rotation, i.translation, centre)?;
+            let place = format!("camera {}", i.camera);
+            let pixels = pinhole(&cameras_file, &place, camera.size, camera.focal, camera.principal, pose)?;
+            let image = find_image(&images_file.display().to_string(), &i.name, &folders)?;
+            let intrinsics = Intrinsics::Pixels(pixels);
+            Ok(Photo { name: i.name, image, mask: None, intrinsics, lens: camera.lens, further: false })
+        })
+        .collect::<Result<Vec<_>, SceneError>>()?;
+    let mut notes = Vec::new();
+    if binary && folder.join("cameras.txt").is_file() {
+        notes.push(format!("{}: the binary files are read, not the text files beside them", folder.display()));
+    }
+    Ok(Cameras { format: Format::Colmap, photos, files: vec![cameras_file, images_file], notes })
+}

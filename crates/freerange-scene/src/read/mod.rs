@@ -1,0 +1,400 @@
+//! Cameras as other programs write them: which program's they are, and one reader for each.
+//!
+//! Every reader takes bytes that nobody has checked. Counts claimed by a file are believed only as far as the bytes go that are
+//! really there, and what cannot be used is refused with file, place and field.
+
+pub mod colmap;
+pub mod metashape;
+pub mod polycam;
+pub mod realitycapture;
+mod transforms;
+pub mod turntable;
+
+use crate::{SceneError, error::In};
+use freerange_camera::{Camera, Lens, scene::nearest_rotation};
+use glam::{DMat3, DMat4, DVec3};
+use std::{
+    io::Read,
+    path::{Path, PathBuf},
+};
+pub use turntable::Turntable;
+
+/// Largest image side accepted, in pixels.
+pub(crate) const LARGEST_SIDE: u32 = 16384;
+/// Largest file of cameras accepted, in bytes: COLMAP's with all keypoints of thousands of photos.
+const LARGEST_FILE: u64 = 1 << 30;
+/// Photos of one scene, at most.
+pub(crate) const LARGEST_SCENE: usize = 10_000;
+/// Largest accepted coordinate of a camera; beyond it float32 renderers see nothing but rounding.
+const LARGEST_COORDINATE: f64 = 1e6;
+/// Image files that are taken without being named.
+pub(crate) const IMAGES: [&str; 4] = ["png", "jpg", "jpeg", "webp"];
+
+/// Whose cameras they are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Format {
+    /// `transforms.json` of NeRF tools and nerfstudio.
+    Transforms,
+    /// COLMAP's `cameras` and `images`, binary or text.
+    Colmap,
+    /// Polycam's raw export: one JSON file per photo.
+    Polycam,
+    /// Agisoft Metashape's camera export, XML.
+    Metashape,
+    /// RealityCapture's (RealityScan's) registration export, CSV.
+    Realitycapture,
+    /// None: photos at even steps around the object.
+    Turntable,
+}
+
+impl Format {
+    /// All that a folder can be found to be.
+    pub const ALL: [Self; 5] = [Self::Transforms, Self::Colmap, Self::Polycam, Self::Metashape, Self::Realitycapture];
+
+    /// As in options and reports.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Transforms => "transforms",
+            Self::Colmap => "colmap",
+            Self::Polycam => "polycam",
+            Self::Metashape => "metashape",
+            Self::Realitycapture => "realitycapture",
+            Self::Turntable => "turntable",
+        }
+    }
+}
+
+/// How large the camera's image is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Intrinsics {
+    /// In pixels of an image of known size.
+    Pixels(Camera),
+    /// Relative to the image's longer side, for formats that do not tell sizes: focal length, and offset of the principal point
+    /// from the middle.
+    Relative {
+        /// Focal length divided by the longer side.
+        focal: f64,
+        /// Principal point minus the middle, x and y, divided by the longer side.
+        offset: [f64; 2],
+        /// Rigid transform from world to camera.
+        world_to_camera: DMat4,
+    },
+}
+
+/// A photo with its camera, as a reader found it; the image itself has not been looked at.
+#[derive(Clone, Debug)]
+pub struct Photo {
+    /// File name as the format gives it, folders included.
+    pub name: String,
+    /// The image file.
+    pub image: PathBuf,
+    /// The mask file that the format names.
+    pub mask: Option<PathBuf>,
+    /// Its camera, without the lens.
+    pub intrinsics: Intrinsics,
+    /// Its lens.
+    pub lens: Lens,
+    /// Only compared with, not reconstructed from.
+    pub further: bool,
+}
+
+impl Photo {
+    /// The camera for an image of `size` (width, height), which must have the shape that the camera was made for.
+    pub fn camera(&self, size: (u32, u32)) -> Result<Camera, SceneError> {
+        let (width, height) = size;
+        match self.intrinsics {
+            Intrinsics::Pixels(camera) => {
+                let expected = (camera.width, camera.height);
+                // The same shape, up to one pixel of rounding.
+                let (a, b) = (u64::from(width) * u64::from(expected.1), u64::from(height) * u64::from(expected.0));
+                if a.abs_diff(b) > u64::from(expected.0.max(expected.1)) {
+                    let file = self.image.clone();
+                    return Err(SceneError::Size { file, of: "its camera's", expected, found: size });
+                }
+                Ok(camera.resized(width, height))
+            }
+            Intrinsics::Relative { focal, offset, world_to_camera } => {
+                let side = f64::from(width.max(height));
+                let (cx, cy) = (0.5 * f64::from(width) + side * offset[0], 0.5 * f64::from(height) + side * offset[1]);
+                Ok(Camera { width, height, fx: side * focal, fy: side * focal, cx, cy, world_to_camera })
+            }
+        }
+    }
+}
+
+/// What a reader found.
+#[derive(Clone, Debug)]
+pub struct Cameras {
+    /// Whose they are.
+    pub format: Format,
+    /// The photos, in the order of the file.
+    pub photos: Vec<Photo>,
+    /// The files that were read.
+    pub files: Vec<PathBuf>,
+    /// What was understood or passed over, for the user to read.
+    pub notes: Vec<String>,
+}
+
+/// Reads the cameras of a scene: a folder, or a file of one of the formats.
+///
+/// `format` decides where a folder could be two things; without it that is an error that names both. `turntable` takes a folder
+/// of photos without any cameras.
+pub fn cameras(path: &Path, format: Option<Format>, turntable: Option<&Turntable>) -> Result<Cameras, SceneError> {
+    let metadata = std::fs::metadata(path).map_err(|e| In(path).read(e))?;
+    if let Some(turntable) = turntable {
+        return turntable::read(path, turntable);
+    }
+    let cameras = if metadata.is_dir() {
+        let mut found: Vec<(Format, PathBuf)> = Vec::new();
+        for candidate in Format::ALL {
+            if format.is_none_or(|f| f == candidate) {
+                found.extend(look_for(path, candidate)?.map(|file| (candidate, file)));
+            }
+        }
+        match found.as_slice() {
+            [] => return Err(nothing(path, format)?),
+            [(format, file)] => read(*format, file)?,
+            [(a, first), (b, second), ..] => {
+                return Err(SceneError::Ambiguous {
+                    folder: path.into(),
+                    first: format!("{} ({})", a.name(), first.display()),
+                    second: format!("{} ({})", b.name(), second.display()),
+                    advice: format!("say which with --cameras {} or --cameras {}", a.name(), b.name()),
+                });
+            }
+        }
+    } else {
+        let extension = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
+        let own = match extension.as_deref() {
+            Some("json") => Format::Transforms,
+            Some("xml") => Format::Metashape,
+            Some("csv") => Format::Realitycapture,
+            Some("bin" | "txt") => Format::Colmap,
+            _ => {
+                let expected = "a folder, or a file .json, .xml or .csv";
+                return Err(In(path).field("", "file name", expected, path.display()));
+            }
+        };
+        if let Some(format) = format.filter(|f| *f != own) {
+            let expected = format!("{} for this file", own.name());
+            return Err(SceneError::Option { option: "--cameras", expected, found: format.name().into() });
+        }
+        match own {
+            Format::Colmap => colmap::read(path.parent().unwrap_or(Path::new("")))?,
+            own => read(own, path)?,
+        }
+    };
+    if cameras.photos.len() > LARGEST_SCENE {
+        let found = cameras.photos.len();
+        return Err(In(path).field("", "photos", &format!("at most {LARGEST_SCENE}"), found));
+    }
+    Ok(cameras)
+}
+
+fn read(format: Format, file: &Path) -> Result<Cameras, SceneError> {
+    match format {
+        Format::Transforms => transforms::read(file),
+        Format::Colmap => colmap::read(file),
+        Format::Polycam => polycam::read(file),
+        Format::Metashape => metashape::read(file),
+        Format::Realitycapture => realitycapture::read(file),
+        Format::Turntable => Err(SceneError::Option {
+            option: "--cameras",
+            expected: "the format of a file; turntables have --turntable ELEVATION,FOV".into(),
+            found: "turntable".into(),
+        }),
+    }
+}
+
+/// The file or folder that makes `folder` a scene of this format, if it is one.
+fn look_for(folder: &Path, format: Format) -> Result<Option<PathBuf>, SceneError> {
+    Ok(match format {
+        Format::Transforms => {
+            let there = ["transforms.json", "transforms_train.json"].iter().any(|n| folder.join(n).is_file());
+            there.then(|| folder.to_path_buf())
+        }
+        Format::Colmap => colmap::look_for(folder)?,
+        Format::Polycam => polycam::look_for(folder),
+        Format::Metashape => single(folder, "xml", metashape::is_one)?,
+        Format::Realitycapture => single(folder, "csv", realitycapture::is_one)?,
+        Format::Turntable => None,
+    })
+}
+
+/// The one file with this extension that looks right; several are an error that names two.
+fn single(folder: &Path, extension: &str, right: fn(&[u8]) -> bool) -> Result<Option<PathBuf>, SceneError> {
+    let mut found = Vec::new();
+    for path in entries(folder)? {
+        if has_extension(&path, &[extension]) && path.is_file() && right(&start_of(&path)?) {
+            found.push(path);
+        }
+    }
+    match found.as_slice() {
+        [first, second, ..] => Err(SceneError::Ambiguous {
+            folder: folder.into(),
+            first: first.display().to_string(),
+            second: second.display().to_string(),
+            advice: "name the file instead of the folder".into(),
+        }),
+        _ => Ok(found.pop()),
+    }
+}
+
+fn nothing(folder: &Path, format: Option<Format>) -> Result<SceneError, SceneError> {
+    let names: Vec<String> = entries(folder)?
+        .iter()
+        .take(8)
+        .filter_map(|p| p.file_name().map(|n| n.to_string_lossy().into_owned()))
+        .collect();
+    let found = if names.is_empty() { "an empty folder".into() } else { names.join(", ") };
+    Ok(match format {
+        Some(format) => SceneError::Option {
+            option: "--cameras",
+            expected: format!("a folder with {} cameras", format.name()),
+            found: format!("{}: {found}", folder.display()),
+        },
+        None => SceneError::Nothing { folder: folder.into(), found },
+    })
+}
+
+/// What a folder holds, sorted by name.
+pub(crate) fn entries(folder: &Path) -> Result<Vec<PathBuf>, SceneError> {
+    let failed = |e| In(folder).read(e);
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(folder).map_err(failed)?.take(100_000) {
+        found.push(entry.map_err(failed)?.path());
+    }
+    found.sort();
+    Ok(found)
+}
+
+pub(crate) fn has_extension(path: &Path, extensions: &[&str]) -> bool {
+    path.extension().is_some_and(|e| extensions.iter().any(|known| e.eq_ignore_ascii_case(known)))
+}
+
+/// A whole file, if it is of a size that such files have.
+pub(crate) fn bytes_of(file: &Path) -> Result<Vec<u8>, SceneError> {
+    read_up_to(file, LARGEST_FILE + 1).and_then(|bytes| {
+        let found = bytes.len() as u64;
+        match found > LARGEST_FILE {
+            true => Err(SceneError::TooLarge { file: file.into(), limit: LARGEST_FILE, found }),
+            false => Ok(bytes),
+        }
+    })
+}
+
+fn start_of(file: &Path) -> Result<Vec<u8>, SceneError> {
+    read_up_to(file, 4096)
+}
+
+fn read_up_to(file: &Path, limit: u64) -> Result<Vec<u8>, SceneError> {
+    let failed = |e| In(file).read(e);
+    // A pipe or device would never end.
+    if !std::fs::metadata(file).map_err(failed)?.is_file() {
+        return Err(failed(std::io::Error::other("not a regular file")));
+    }
+    let mut bytes = Vec::new();
+    std::fs::File::open(file).and_then(|f| f.take(limit).read_to_end(&mut bytes)).map_err(failed)?;
+    Ok(bytes)
+}
+
+/// A file's text; the place of the first byte that is not UTF-8 is an error.
+pub(crate) fn text_of<'a>(file: &Path, bytes: &'a [u8]) -> Result<&'a str, SceneError> {
+    let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
+    std::str::from_utf8(bytes).map_err(|e| In(file).malformed(&format!("byte {}", e.valid_up_to()), "not UTF-8 text"))
+}
+
+/// Joins a path that a file names to a folder, if it stays inside: names are other people's.
+pub(crate) fn inside(folder: &Path, name: &str) -> Option<PathBuf> {
+    let name = name.replace('\\', "/");
+    let relative = Path::new(&name);
+    let normal = |c| matches!(c, std::path::Component::Normal(_) | std::path::Component::CurDir);
+    (!name.is_empty() && !name.contains('\0') && relative.components().all(normal)).then(|| folder.join(relative))
+}
+
+/// The image called `name` in the first of `folders` that has it: as written, by its file name alone, or with an extension added.
+pub(crate) fn find_image(place: &str, name: &str, folders: &[PathBuf]) -> Result<PathBuf, SceneError> {
+    let alone = name.rsplit(['/', '\\']).next().unwrap_or(name);
+    for name in [name, alone] {
+        for path in folders.iter().filter_map(|folder| inside(folder, name)) {
+            if path.is_file() {
+                return Ok(path);
+            }
+            for extension in IMAGES.into_iter().chain(["JPG", "PNG", "JPEG"]) {
+                let mut longer = path.clone().into_os_string();
+                longer.push(".");
+                longer.push(extension);
+                if Path::new(&longer).is_file() {
+                    return Ok(longer.into());
+                }
+            }
+        }
+    }
+    let folders = folders.iter().map(|f| f.display().to_string()).collect();
+    Err(SceneError::MissingImage { place: place.into(), image: name.into(), folders })
+}
+
+/// A camera in pixels, its numbers checked. `size` is width and height, `focal` and `principal` x and y.
+pub(crate) fn pinhole(
+    file: &Path,
+    place: &str,
+    size: (u64, u64),
+    focal: [f64; 2],
+    principal: [f64; 2],
+    world_to_camera: DMat4,
+) -> Result<Camera, SceneError> {
+    let side = |name: &str, v: u64| match v {
+        1..=16384 => Ok(v as u32),
+        _ => Err(In(file).field(place, name, &format!("a whole number from 1 to {LARGEST_SIDE}"), v)),
+    };
+    let (width, height) = (side("width", size.0)?, side("height", size.1)?);
+    for (i, (name, side)) in [("focal length", width), ("focal length", height)].into_iter().enumerate() {
+        let side = f64::from(side);
+        if !(1e-2 * side..=1e3 * side).contains(&focal[i]) {
+            let expected = format!("between 0.01 and 1000 times the image's {side} pixels");
+            return Err(In(file).field(place, name, &expected, focal[i]));
+        }
+        if !(-side..=2.0 * side).contains(&principal[i]) {
+            let expected = format!("a point near the image's {side} pixels");
+            return Err(In(file).field(place, ["cx", "cy"][i], &expected, principal[i]));
+        }
+    }
+    Ok(Camera { width, height, fx: focal[0], fy: focal[1], cx: principal[0], cy: principal[1], world_to_camera })
+}
+
+/// World to camera from the camera's axes (columns: right, down, forward, in world coordinates) and its centre.
+pub(crate) fn world_to_camera(file: &Path, place: &str, axes: DMat3, centre: DVec3) -> Result<DMat4, SceneError> {
+    let rotation = nearest_rotation(axes)
+        .map_err(|found| In(file).field(place, "rotation", "a rotation matrix", found))?
+        .transpose();
+    rigid(file, place, rotation, -(rotation * centre), centre)
+}
+
+/// World to camera from its rotation and translation; `centre` is the camera's.
+pub(crate) fn rigid(
+    file: &Path,
+    place: &str,
+    rotation: DMat3,
+    translation: DVec3,
+    centre: DVec3,
+) -> Result<DMat4, SceneError> {
+    if !(centre.abs().max_element() <= LARGEST_COORDINATE && translation.is_finite()) {
+        let expected = format!("a camera within {LARGEST_COORDINATE} of the origin");
+        return Err(In(file).field(place, "position", &expected, centre));
+    }
+    Ok(DMat4::from_cols(
+        rotation.x_axis.extend(0.0),
+        rotation.y_axis.extend(0.0),
+        rotation.z_axis.extend(0.0),
+        translation.extend(1.0),
+    ))
+}
+
+/// Distortion coefficients that a lens can have; those far beyond are errors of reading.
+pub(crate) fn coefficients(file: &Path, place: &str, names: &[&str], values: &[f64]) -> Result<(), SceneError> {
+    match names.iter().zip(values).find(|(_, v)| v.is_nan() || v.abs() > 100.0) {
+        Some((name, v)) => Err(In(file).field(place, name, "a distortion coefficient between -100 and 100", v)),
+        None => Ok(()),
+    }
+}

@@ -1,0 +1,176 @@
+//! Masks from poses and colours: on a scene drawn here, on broken poses, and on the photo-like scenes of the shared folder.
+
+use freerange_camera::{Camera, View};
+use freerange_scene::{
+    LoadConfig, MaskSource, SceneError,
+    estimate::{Hints, agreement, masks, overlap, table_faces},
+    load,
+    read::cameras,
+};
+use glam::DVec3;
+use image::{Rgba, RgbaImage};
+use std::path::PathBuf;
+
+const W: u32 = 240;
+const H: u32 = 180;
+
+/// Where a ray meets the object (a block with a ball on it), and the normal there.
+fn object(eye: DVec3, d: DVec3) -> Option<(f64, DVec3)> {
+    let mut best: Option<(f64, DVec3)> = None;
+    let (low, high) = (DVec3::new(-0.16, -0.1, 0.0), DVec3::new(0.14, 0.12, 0.13));
+    let (a, b) = ((low - eye) / d, (high - eye) / d);
+    let (near, far) = (a.min(b), a.max(b));
+    if near.max_element() < far.min_element() && near.max_element() > 0.0 {
+        let axis = (0..3).max_by(|i, j| near[*i].total_cmp(&near[*j])).unwrap();
+        let mut normal = DVec3::ZERO;
+        normal[axis] = -d[axis].signum();
+        best = Some((near.max_element(), normal));
+    }
+    let (centre, r) = (DVec3::new(-0.02, 0.02, 0.19), 0.09);
+    let to = centre - eye;
+    let along = to.dot(d);
+    let square = r * r - (to.length_squared() - along * along);
+    if square > 0.0 {
+        let t = along - square.sqrt();
+        if t > 0.0 && best.is_none_or(|b| t < b.0) {
+            best = Some((t, (eye + t * d - centre) / r));
+        }
+    }
+    best
+}
+
+/// A view of the object on a table in the plane `z = 0`, with its shadow, and of walls around it; and the true mask.
+fn draw(camera: &Camera) -> (RgbaImage, Vec<bool>) {
+    let light = DVec3::new(0.5, -0.3, 1.0).normalize();
+    let mut mask = Vec::new();
+    let image = RgbaImage::from_fn(W, H, |x, y| {
+        let (eye, d) = (camera.center(), camera.ray_direction(f64::from(x) + 0.5, f64::from(y) + 0.5));
+        let hit = object(eye, d);
+        mask.push(hit.is_some());
+        let colour = if let Some((t, normal)) = hit {
+            let p = eye + t * d;
+            let stripe =
+                if (p.z * 60.0).sin() > 0.3 { DVec3::new(60.0, 110.0, 190.0) } else { DVec3::new(200.0, 205.0, 215.0) };
+            stripe * (0.45 + 0.5 * normal.dot(light).max(0.0))
+        } else if d.z < 0.0 && (eye - d * (eye.z / d.z)).truncate().abs().max_element() < 0.9 {
+            let p = eye - d * (eye.z / d.z);
+            let grain = 0.5 + 0.5 * (9.0 * p.x + 3.0 * (7.0 * p.y).sin()).sin();
+            let wood = DVec3::new(150.0, 105.0, 70.0).lerp(DVec3::new(205.0, 165.0, 120.0), grain);
+            let shadow = object(p + 1e-6 * DVec3::Z, light).is_some();
+            wood * if shadow { 0.45 } else { 1.0 }
+        } else {
+            DVec3::new(120.0 + 60.0 * d.x, 130.0 - 40.0 * d.y, 140.0 + 50.0 * d.z)
+        };
+        let noise = f64::from((x * 7919 + y * 104_729) % 7) - 3.0;
+        let [r, g, b] = (colour + noise).to_array().map(|v| v.clamp(0.0, 255.0) as u8);
+        Rgba([r, g, b, 255])
+    });
+    (image, mask)
+}
+
+/// Eight views by hand: around the object, not quite aimed at it.
+fn scene() -> (Vec<View>, Vec<Vec<bool>>) {
+    (0..8)
+        .map(|i| {
+            let i = f64::from(i);
+            let (azimuth, elevation) = (0.8 * i + 0.2 * (3.0 * i).sin(), 0.45 + 0.2 * (2.0 * i).sin());
+            let distance = 1.0 + 0.1 * i.cos();
+            let eye = distance
+                * DVec3::new(azimuth.cos() * elevation.cos(), azimuth.sin() * elevation.cos(), elevation.sin())
+                + DVec3::new(0.0, 0.0, 0.1);
+            let target = DVec3::new(0.02 * (5.0 * i).sin(), 0.02 * i.cos(), 0.12 + 0.02 * (2.5 * i).sin());
+            let up = DVec3::new(0.1 * i.sin(), 0.1 * (2.0 * i).cos(), 1.0);
+            let camera = Camera::look_at(eye, target, up, 0.9, W, H);
+            let (image, mask) = draw(&camera);
+            (View { name: format!("{i}"), camera, image }, mask)
+        })
+        .unzip()
+}
+
+fn solid(alpha: &[u8]) -> Vec<bool> {
+    alpha.iter().map(|a| *a >= 128).collect()
+}
+
+#[test]
+fn an_object_on_a_table_is_cut_out() {
+    let (views, truth) = scene();
+    let found = masks(&views, &Hints::default()).unwrap();
+    for (i, (alpha, truth)) in found.alpha.iter().zip(&truth).enumerate() {
+        let share = overlap(&solid(alpha), truth);
+        assert!(share > 0.95, "view {i}: {share}, agreement {}", found.agreement[i]);
+    }
+    assert!(found.sureness() > 0.85, "{}", found.sureness());
+    // The table tells which way is up, far better than the cameras.
+    assert!(found.up.unwrap().angle_between(DVec3::Z) < 0.02, "{:?}", found.up);
+    // Also where masks are given.
+    let cut: Vec<View> = views
+        .iter()
+        .zip(&truth)
+        .map(|(v, mask)| {
+            let mut v = v.clone();
+            v.image.pixels_mut().zip(mask).for_each(|(p, m)| p[3] = if *m { 255 } else { 0 });
+            v
+        })
+        .collect();
+    let whole: Vec<RgbaImage> = views.iter().map(|v| v.image.clone()).collect();
+    assert!(table_faces(&cut, &whole).unwrap().angle_between(DVec3::Z) < 0.02);
+    // True masks agree with their hull; a mask in another's place does not.
+    let centre = DVec3::new(0.0, 0.0, 0.13);
+    assert!(agreement(&cut, centre, 0.4).iter().all(|a| *a > 0.85));
+}
+
+#[test]
+fn the_same_photos_give_the_same_masks() {
+    let (mut views, _) = scene();
+    views.truncate(4);
+    let [a, b] = [0, 1].map(|_| masks(&views, &Hints::default()).unwrap());
+    assert_eq!((a.alpha, a.agreement), (b.alpha, b.agreement));
+}
+
+#[track_caller]
+fn refused(views: &[View], words: &[&str]) {
+    let text = match masks(views, &Hints::default()) {
+        Err(e @ SceneError::NotCutOut { .. }) => e.to_string(),
+        other => panic!("expected a refusal, found {:?}", other.map(|e| (e.agreement.clone(), e.sureness()))),
+    };
+    words.iter().for_each(|w| assert!(text.contains(w), "expected {w:?} in: {text}"));
+}
+
+#[test]
+fn views_that_contradict_each_other_are_refused() {
+    let (views, _) = scene();
+    // Cameras that look away from each other.
+    let away: Vec<View> = views
+        .iter()
+        .map(|v| {
+            let eye = v.camera.center();
+            View { camera: Camera::look_at(eye, 2.0 * eye, DVec3::Z, 0.9, W, H), ..v.clone() }
+        })
+        .collect();
+    refused(&away, &["common point"]);
+    refused(&views[..2], &["at least 3 views"]);
+}
+
+/// Photo-like scenes with true masks.
+#[test]
+#[ignore = "needs FREERANGE_SHARED"]
+fn photo_like_scenes_are_cut_out() {
+    let shared = PathBuf::from(std::env::var_os("FREERANGE_SHARED").expect("FREERANGE_SHARED"));
+    for scene in ["bowl", "bread", "ketchup", "mug"] {
+        let folder = shared.join("photos").join(scene);
+        let found = cameras(&folder, None, None).unwrap();
+        let loaded = load(&found, &LoadConfig::default()).unwrap();
+        let truth = MaskSource::Files(folder.join("truth/masks"));
+        let truth = load(&found, &LoadConfig { masks: truth, ..LoadConfig::default() }).unwrap();
+        let shares: Vec<f64> = (loaded.views.iter().zip(&truth.views))
+            .map(|(a, b)| {
+                let mask = |v: &View| v.image.pixels().map(|p| p[3] >= 128).collect::<Vec<_>>();
+                overlap(&mask(a), &mask(b))
+            })
+            .collect();
+        let mean = shares.iter().sum::<f64>() / shares.len() as f64;
+        assert!(mean > 0.97 && shares.iter().all(|s| *s > 0.9), "{scene}: {shares:?}");
+        let up = loaded.estimate.unwrap().up.expect("a table");
+        assert!(up.angle_between(DVec3::Z) < 0.02, "{scene}: {up}");
+    }
+}

@@ -1,0 +1,149 @@
+//! Reading compressed `.ply` files, as PlayCanvas and SuperSplat write them.
+//!
+//! The element `chunk` has bounds of 256 Gaussians each: of positions, log-scales and, in newer files, colours. The
+//! element `vertex` has four words of 32 bits: position and log-scale in 11, 10 and 11 bits between these bounds;
+//! rotation as the number of the largest of `w x y z` in 2 bits and the others in 10 each; colour and opacity in 8 bits
+//! each.
+
+use crate::cloud::Row;
+use crate::ply::{PlyFile, Values, property_error, value_error};
+use crate::ply_header::{Element, Header, Kind, Scalar};
+use crate::{Cloud, SplatError, channel};
+use std::{io::BufRead, path::Path};
+
+/// Gaussians per chunk.
+const CHUNK: u64 = 256;
+/// The words of a Gaussian.
+const WORDS: [&str; 4] = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
+/// The bounds of a chunk, least and greatest of three each; colours may be missing, and are 0 and 1 then.
+const BOUNDS: [&str; 18] = [
+    "min_x",
+    "min_y",
+    "min_z",
+    "max_x",
+    "max_y",
+    "max_z",
+    "min_scale_x",
+    "min_scale_y",
+    "min_scale_z",
+    "max_scale_x",
+    "max_scale_y",
+    "max_scale_z",
+    "min_r",
+    "min_g",
+    "min_b",
+    "max_r",
+    "max_g",
+    "max_b",
+];
+const WITHOUT_COLOR: usize = 12;
+
+/// Whether `vertex` is compressed.
+pub(crate) fn is_compressed(vertex: &Element) -> bool {
+    vertex.properties.iter().any(|p| p.name == WORDS[0])
+}
+
+/// Reads the elements up to `vertex`, which is number `at`.
+pub(crate) fn read<R: BufRead>(mut values: Values<'_, R>, header: &Header, at: usize) -> Result<PlyFile, SplatError> {
+    let (file, vertex) = (values.file, &header.elements[at]);
+    let Some(chunk) = header.elements[..at].iter().find(|e| e.name == "chunk") else {
+        return Err(property_error(file, WORDS[0], "an element \"chunk\" before", "none"));
+    };
+    let bound_of = columns(chunk, &BOUNDS, WITHOUT_COLOR, file, Scalar::is_float, "float or double")?;
+    let word_of = columns(vertex, &WORDS, WORDS.len(), file, |s| s == Scalar::U32, "uint")?;
+
+    let mut chunks: Vec<[f32; 18]> = Vec::new();
+    for element in &header.elements[..at] {
+        let mut bounds = [0.0; 18];
+        bounds[15..].fill(1.0);
+        values.rows(element, |i, column, value| {
+            if element.name != "chunk" {
+                return Ok(());
+            }
+            if let Some(b) = bound_of[column] {
+                bounds[b] = value as f32;
+                if !bounds[b].is_finite() {
+                    let found = bounds[b].to_string();
+                    return Err(value_error(file, element, i, BOUNDS[b], "a finite number", &found));
+                }
+            }
+            if column + 1 == bound_of.len() {
+                chunks.push(bounds);
+            }
+            Ok(())
+        })?;
+    }
+
+    let mut rows = Vec::new();
+    let mut words = [0u32; 4];
+    values.rows(vertex, |i, column, value| {
+        if let Some(w) = word_of[column] {
+            words[w] = value as u32; // an ascii file may hold other numbers: clamped
+        }
+        if column + 1 == word_of.len() {
+            let Some(bounds) = usize::try_from(i / CHUNK).ok().and_then(|c| chunks.get(c)) else {
+                let found = format!("{} chunks of {CHUNK}", chunks.len());
+                return Err(value_error(file, vertex, i, WORDS[0], "a chunk for every Gaussian", &found));
+            };
+            rows.extend(unpack(words, bounds));
+        }
+        Ok(())
+    })?;
+    let rest = header.elements.iter().find(|e| e.name == "sh").map(|e| e.properties.len());
+    let notes = rest
+        .map(|n| format!("{n} properties f_rest_* (colour that depends on the viewing direction) are left out"))
+        .into_iter()
+        .collect();
+    Ok(PlyFile { cloud: Cloud::from_rows(rows), notes })
+}
+
+/// Which of `names` each property of `element` is, if any; the first `needed` have to be there.
+fn columns(
+    element: &Element,
+    names: &[&str],
+    needed: usize,
+    file: &Path,
+    fits: impl Fn(Scalar) -> bool,
+    expected: &str,
+) -> Result<Vec<Option<usize>>, SplatError> {
+    for name in &names[..needed] {
+        match element.properties.iter().find(|p| p.name == *name).map(|p| p.kind) {
+            Some(Kind::Single(scalar)) if fits(scalar) => {}
+            Some(Kind::Single(scalar)) => return Err(property_error(file, name, expected, scalar.name())),
+            Some(Kind::List(..)) => return Err(property_error(file, name, expected, "a list")),
+            None => return Err(property_error(file, name, "it, as every compressed file has it", "no such property")),
+        }
+    }
+    Ok(element.properties.iter().map(|p| names.iter().position(|name| *name == p.name)).collect())
+}
+
+fn unpack([position, rotation, scale, color]: [u32; 4], bounds: &[f32; 18]) -> Row {
+    // `v`'s bits from `low` up, `count` of them, as 0..1.
+    let part = |v: u32, low: u32, count: u32| {
+        let whole = (1u32 << count) - 1;
+        f64::from(v >> low & whole) / f64::from(whole)
+    };
+    let within = |at: usize, k: usize, t: f64| {
+        let (least, greatest) = (f64::from(bounds[at + k]), f64::from(bounds[at + 3 + k]));
+        least * (1.0 - t) + greatest * t
+    };
+    let three = |v: u32| [part(v, 21, 11), part(v, 11, 10), part(v, 0, 11)];
+    let mut row = Row::default();
+    for k in 0..3 {
+        row[k] = within(0, k, three(position)[k]) as f32;
+        row[channel::LOG_SCALE.start + k] = within(6, k, three(scale)[k]) as f32;
+        row[channel::COLOR.start + k] = within(12, k, part(color, 24 - 8 * k as u32, 8)) as f32;
+    }
+    // The first and the last step stand for half a one each: the logit of its middle.
+    let opacity = part(color, 0, 8).clamp(0.25 / 255.0, 254.75 / 255.0);
+    row[channel::LOGIT_OPACITY] = (opacity / (1.0 - opacity)).ln() as f32;
+    let others = [20, 10, 0].map(|low| (part(rotation, low, 10) - 0.5) * std::f64::consts::SQRT_2);
+    let largest = (1.0 - others.iter().map(|v| v * v).sum::<f64>()).max(0.0).sqrt();
+    let mut q = others.to_vec();
+    q.insert((rotation >> 30) as usize, largest);
+    let length = q.iter().map(|v| v * v).sum::<f64>().sqrt();
+    for (channel, v) in row[channel::ROTATION].iter_mut().zip(q) {
+        *channel = (v / length) as f32;
+    }
+    row
+}

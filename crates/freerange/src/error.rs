@@ -1,0 +1,80 @@
+use std::path::PathBuf;
+
+use freerange_flow::FlowError;
+
+/// Why there is no reconstruction.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// The caller's `progress` asked to stop.
+    #[error("cancelled")]
+    Cancelled,
+    /// A view or an option cannot be used.
+    #[error("{field}: expected {expected}, found {found}")]
+    Input {
+        /// Which one.
+        field: String,
+        /// What it may be.
+        expected: String,
+        /// What it is.
+        found: String,
+    },
+    /// A device that this program does not have, or that cannot do what is asked of it.
+    #[error("{0}")]
+    NoDevice(String),
+    /// A device that is there and does not work.
+    #[error("{0}")]
+    BrokenDevice(String),
+    /// Reading or writing a file failed.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// The reason.
+        source: std::io::Error,
+    },
+    /// A picture could not be written.
+    #[error("{}: {source}", path.display())]
+    Picture {
+        /// The file.
+        path: PathBuf,
+        /// The reason.
+        source: image::ImageError,
+    },
+    /// The scene, its frame, or the choice of views.
+    #[error(transparent)]
+    Camera(#[from] freerange_camera::CameraError),
+    /// The quick fit or the refinement.
+    #[error(transparent)]
+    Fit(#[from] freerange_fit::FitError),
+    /// Sampling.
+    #[error(transparent)]
+    Flow(FlowError),
+    /// A metric.
+    #[error(transparent)]
+    Metrics(#[from] freerange_metrics::MetricsError),
+    /// The model or its files.
+    #[error(transparent)]
+    Model(#[from] freerange_model::ModelError),
+    /// The rasteriser.
+    #[error(transparent)]
+    Raster(#[from] freerange_raster::RasterError),
+    /// Gaussians or their files.
+    #[error(transparent)]
+    Splat(#[from] freerange_splat::SplatError),
+}
+
+impl Error {
+    pub(crate) fn input(field: impl Into<String>, expected: impl Into<String>, found: impl ToString) -> Self {
+        Self::Input { field: field.into(), expected: expected.into(), found: found.to_string() }
+    }
+}
+
+impl From<FlowError> for Error {
+    fn from(e: FlowError) -> Self {
+        match e {
+            FlowError::Cancelled => Self::Cancelled,
+            e => Self::Flow(e),
+        }
+    }
+}

@@ -1,0 +1,304 @@
+//! The main job: posed images in the user's frame in, Gaussians in the user's frame out.
+
+use std::{ops::ControlFlow, path::Path, time::Instant};
+
+use burn::tensor::Device;
+use freerange_camera::{CanonicalFrame, FrameConfig, Similarity, View, canonical_from_user, inputs_around};
+use freerange_fit::{FitProgress, RefineConfig, frame_of, quick_fit, refine, tree_slice};
+use freerange_flow::sample::{SampleConfig, reconstruct};
+use freerange_model::Checkpoint;
+use freerange_splat::Cloud;
+
+use crate::{EncoderPlaces, Error, Options, Progress, Stage, load_checkpoint, require};
+
+/// A model on a device, ready to reconstruct one object after the other.
+#[derive(Clone, Debug)]
+pub struct Reconstructor {
+    checkpoint: Checkpoint,
+    device: Device,
+}
+
+/// One sample.
+#[derive(Clone, Debug)]
+#[non_exhaustive]
+pub struct Sample {
+    /// The seed it was drawn with.
+    pub seed: u64,
+    /// The Gaussians, in the frame of the views.
+    pub gaussians: Cloud,
+    /// The same before refinement; none where there was none.
+    pub unrefined: Option<Cloud>,
+    /// `gaussians` in the canonical frame: around the origin within a radius of 0.5, +z up.
+    pub canonical: Cloud,
+}
+
+/// A reconstruction and what it took.
+#[derive(Clone, Debug)]
+#[non_exhaustive]
+pub struct Reconstruction {
+    /// One per seed.
+    pub samples: Vec<Sample>,
+    /// Which of the views the model was shown, ascending.
+    pub shown: Vec<usize>,
+    /// From the frame of the views to the canonical one.
+    pub canonical_from_user: Similarity,
+    /// What the user should know.
+    pub notes: Vec<String>,
+    /// Seconds per stage, in order.
+    pub seconds: Vec<(Stage, f64)>,
+}
+
+impl Reconstructor {
+    /// The model that is part of this program.
+    ///
+    /// # Errors
+    /// If the device fails.
+    pub fn shipped(device: &Device) -> Result<Self, Error> {
+        Ok(Self::new(load_checkpoint(None, &EncoderPlaces::default(), device)?, device))
+    }
+
+    /// A model from a file. The weights of a frozen encoder are looked for in `encoders`.
+    ///
+    /// # Errors
+    /// Names the file and what is wrong with it.
+    pub fn load(checkpoint: &Path, encoders: &EncoderPlaces, device: &Device) -> Result<Self, Error> {
+        Ok(Self::new(load_checkpoint(Some(checkpoint), encoders, device)?, device))
+    }
+
+    /// A model that is in memory, on `device`, already.
+    pub fn new(checkpoint: Checkpoint, device: &Device) -> Self {
+        Self { checkpoint, device: device.clone() }
+    }
+
+    /// The model.
+    pub fn checkpoint(&self) -> &Checkpoint {
+        &self.checkpoint
+    }
+
+    /// Where it computes.
+    pub fn device(&self) -> &Device {
+        &self.device
+    }
+
+    /// The model's own way to sample and refine: one sample of seed 0, +z up.
+    ///
+    /// # Errors
+    /// If what the checkpoint says of it cannot be used.
+    pub fn options(&self) -> Result<Options, Error> {
+        let sample: SampleConfig = match self.checkpoint.provenance.get("sample") {
+            Some(value) => serde_json::from_value(value.clone())
+                .map_err(|e| Error::input("checkpoint: field `sample` of the metadata", "settings of sampling", e))?,
+            None => SampleConfig::default(),
+        };
+        Ok(Options { sample, seeds: vec![0], views: None, without_network: false, frame: FrameConfig::default() })
+    }
+
+    /// Most views that the model has seen at once in training; the paper's four where its checkpoint does not tell.
+    pub fn views(&self) -> usize {
+        let told = self.checkpoint.provenance.pointer("/configuration/loss/input_views/1");
+        told.and_then(serde_json::Value::as_u64).and_then(|n| n.try_into().ok()).filter(|n| *n > 0).unwrap_or(4)
+    }
+
+    /// Refuses options that this model or its device cannot follow.
+    ///
+    /// # Errors
+    /// Names the option.
+    pub fn check(&self, options: &Options) -> Result<(), Error> {
+        options.sample.validate()?;
+        if options.without_network && options.sample.start.is_none() {
+            return Err(Error::input("sample.start", "a quick fit to start from", "none"));
+        }
+        if options.views == Some(0) {
+            return Err(Error::input("views", "at least 1", 0));
+        }
+        require(options.sample.compute, &self.device)
+    }
+
+    /// Samples Gaussians for two or more views of one object, and refines them if asked to.
+    ///
+    /// `progress` is told of every step, and ends the work by `ControlFlow::Break`.
+    ///
+    /// # Errors
+    /// [`Error::Cancelled`] where `progress` says so; views or options that cannot be used; a device that fails.
+    pub fn run(
+        &self,
+        views: &[View],
+        options: &Options,
+        progress: &mut dyn FnMut(&Progress<'_>) -> ControlFlow<()>,
+    ) -> Result<Reconstruction, Error> {
+        self.check(options)?;
+        check_views(views)?;
+        let mut seconds = Vec::new();
+        let mut tell = |p: &Progress<'_>| match progress(p) {
+            ControlFlow::Continue(()) => Ok(()),
+            ControlFlow::Break(()) => Err(Error::Cancelled),
+        };
+
+        let begin = Instant::now();
+        tell(&Progress::new(Stage::Frame, 0, 1))?;
+        let (mut frame, mut canonical) = to_canonical(views, &options.frame)?;
+        let chosen = choose_views(views, options.views.unwrap_or(self.views()))?;
+        if chosen.len() < views.len() {
+            let names: Vec<&str> = chosen.iter().map(|&i| views[i].name.as_str()).collect();
+            let (shown, all) = (chosen.len(), views.len());
+            frame.notes.push(format!("the model is shown {shown} of {all} views: {}", names.join(", ")));
+        }
+        let mut shown: Vec<View> = chosen.iter().map(|&i| canonical[i].clone()).collect();
+        let uneven = shown.iter().filter(|v| v.image.width() != v.image.height()).count();
+        if uneven > 0 {
+            let all = shown.len();
+            frame
+                .notes
+                .push(format!("{uneven} of {all} views are not square: the model is shown squares, cut or padded"));
+        }
+        seconds.push((Stage::Frame, begin.elapsed().as_secs_f64()));
+
+        let begin = Instant::now();
+        let fit = match &options.sample.start {
+            None => None,
+            Some(start) => {
+                let mut fit =
+                    watched(Stage::Fit, 0, &mut tell, start.fit.iterations, |p| quick_fit(&shown, &start.fit, 0, p))?;
+                // The fit knows better than the masks where the object is; it moves along, so that one is enough.
+                if !frame.kept {
+                    let correction = frame_of(&fit, &shown)?;
+                    fit.transform(correction.scale, correction.rotation, correction.translation);
+                    canonical = moved(&canonical, &correction);
+                    shown = moved(&shown, &correction);
+                    frame.canonical_from_user = correction.after(&frame.canonical_from_user);
+                    let (shift, scale) = (correction.translation.length(), correction.scale);
+                    frame.notes.push(format!("the quick fit moved it by {shift:.3} and scaled it by {scale:.3}"));
+                }
+                seconds.push((Stage::Fit, begin.elapsed().as_secs_f64()));
+                Some(fit)
+            }
+        };
+        let canonical_from_user = frame.canonical_from_user;
+
+        let begin = Instant::now();
+        let clouds = match (&fit, options.without_network) {
+            (Some(fit), true) => {
+                let slice = tree_slice(fit, options.sample.depth.unwrap_or(self.checkpoint.depth))?;
+                vec![slice; options.seeds.len()]
+            }
+            _ => {
+                let total = options.sample.steps;
+                tell(&Progress::new(Stage::Sample, 0, total))?;
+                let fits = fit.as_ref().map(std::slice::from_ref);
+                let (config, seeds) = (&options.sample, &options.seeds);
+                let sampled =
+                    reconstruct(&self.checkpoint, &[&shown], fits, config, seeds, &self.device, |estimate| {
+                        let told = Progress::new(Stage::Sample, estimate.index + 1, total);
+                        let told = Progress { estimate: Some((estimate, &canonical_from_user)), ..told };
+                        tell(&told).map_or(ControlFlow::Break(()), ControlFlow::Continue)
+                    })?;
+                sampled.into_iter().flatten().collect()
+            }
+        };
+        seconds.push((Stage::Sample, begin.elapsed().as_secs_f64()));
+
+        let begin = Instant::now();
+        let mut samples = Vec::with_capacity(clouds.len());
+        for (i, (&seed, plain)) in options.seeds.iter().zip(clouds).enumerate() {
+            let refined = match options.sample.refine {
+                0 => None,
+                steps => {
+                    let config = RefineConfig { steps, seed, ..RefineConfig::default() };
+                    Some(watched(Stage::Refine, i, &mut tell, steps, |p| refine(&plain, &canonical, &config, p))?)
+                }
+            };
+            let (canonical, unrefined) = match refined {
+                Some(refined) => (refined, Some(to_user(&plain, &canonical_from_user))),
+                None => (plain, None),
+            };
+            samples.push(Sample { seed, gaussians: to_user(&canonical, &canonical_from_user), unrefined, canonical });
+        }
+        if options.sample.refine > 0 {
+            seconds.push((Stage::Refine, begin.elapsed().as_secs_f64()));
+        }
+        Ok(Reconstruction { samples, shown: chosen, canonical_from_user, notes: frame.notes, seconds })
+    }
+}
+
+/// Restarts of k-means, as in the evaluation.
+const RESTARTS: usize = 10;
+
+/// At most `most` views from all around the object, as the paper's protocol chooses them; ascending.
+///
+/// # Errors
+/// If the cameras do not allow a choice.
+pub fn choose_views(views: &[View], most: usize) -> Result<Vec<usize>, Error> {
+    let centers: Vec<_> = views.iter().map(|v| v.camera.center()).collect();
+    if views.len() <= most {
+        return Ok((0..views.len()).collect());
+    }
+    // Of views from one place the first is enough.
+    let size = centers.iter().map(|c| c.distance(centers[0])).fold(0.0, f64::max);
+    let mut places: Vec<usize> = Vec::new();
+    for i in 0..views.len() {
+        if places.iter().all(|&j| centers[i].distance(centers[j]) > 1e-6 * size) {
+            places.push(i);
+        }
+    }
+    match places.len() <= most {
+        true => Ok(places),
+        false => Ok(inputs_around(&centers, &places, most, RESTARTS, 0)?),
+    }
+}
+
+/// A fit whose steps are told; what it has when it is stopped is of no use.
+fn watched(
+    stage: Stage,
+    sample: usize,
+    tell: &mut impl FnMut(&Progress<'_>) -> Result<(), Error>,
+    total: usize,
+    fit: impl FnOnce(&mut dyn FnMut(&FitProgress) -> ControlFlow<()>) -> Result<Cloud, freerange_fit::FitError>,
+) -> Result<Cloud, Error> {
+    tell(&Progress { sample, ..Progress::new(stage, 0, total) })?;
+    let mut stopped = Ok(());
+    let cloud = fit(&mut |p| {
+        stopped = tell(&Progress { sample, loss: Some(p.loss), ..Progress::new(stage, p.step, total) });
+        if stopped.is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+    });
+    stopped?;
+    Ok(cloud?)
+}
+
+/// Refuses views whose parts do not fit each other.
+fn check_views(views: &[View]) -> Result<(), Error> {
+    for view in views {
+        let field = |what: &str| format!("view `{}`: {what}", view.name);
+        let (c, (w, h)) = (&view.camera, view.image.dimensions());
+        if (c.width, c.height) != (w, h) || w == 0 || h == 0 {
+            let expected = format!("{} x {} pixels, as its camera has, and some", c.width, c.height);
+            return Err(Error::input(field("image"), expected, format!("{w} x {h}")));
+        }
+        let finite = [c.fx, c.fy, c.cx, c.cy].iter().all(|x| x.is_finite()) && c.world_to_camera.is_finite();
+        if !finite || c.fx <= 0.0 || c.fy <= 0.0 {
+            return Err(Error::input(field("camera"), "finite numbers and focal lengths above 0", format!("{c:?}")));
+        }
+    }
+    Ok(())
+}
+
+/// The views in the canonical frame, and how they got there.
+///
+/// # Errors
+/// If there are fewer than two views, or they do not show one object from different places.
+pub fn to_canonical(views: &[View], config: &FrameConfig) -> Result<(CanonicalFrame, Vec<View>), Error> {
+    let frame = canonical_from_user(views, config)?;
+    let canonical = moved(views, &frame.canonical_from_user);
+    Ok((frame, canonical))
+}
+
+fn moved(views: &[View], to: &Similarity) -> Vec<View> {
+    views.iter().map(|v| View { camera: v.camera.transformed(to), ..v.clone() }).collect()
+}
+
+/// Takes a cloud from the canonical frame to the user's.
+pub fn to_user(cloud: &Cloud, canonical_from_user: &Similarity) -> Cloud {
+    let back = canonical_from_user.inverse();
+    let mut cloud = cloud.clone();
+    cloud.transform(back.scale, back.rotation, back.translation);
+    cloud
+}

@@ -1,0 +1,57 @@
+use freerange_camera::{View, image_ops::composite};
+use freerange_metrics::{psnr, ssim_3dgs};
+use freerange_splat::Cloud;
+use serde::Serialize;
+
+use crate::{
+    Error,
+    pictures::{WHITE, render_view},
+};
+
+/// Agreement of renders with the images of one view, on white at the image's own resolution.
+#[derive(Clone, Debug, Serialize)]
+pub struct ViewScore {
+    /// The view.
+    pub name: String,
+    /// Peak signal-to-noise ratio, dB.
+    pub psnr: f64,
+    /// Structural similarity as the 3DGS papers compute it (11 x 11 Gaussian window, zero padding).
+    pub ssim: f64,
+}
+
+/// Scores of a set of views.
+#[derive(Clone, Debug, Serialize)]
+pub struct Scores {
+    /// Mean over the views, dB.
+    pub psnr: f64,
+    /// Mean over the views.
+    pub ssim: f64,
+    /// Every view.
+    pub views: Vec<ViewScore>,
+}
+
+/// Compares renders of `cloud` with `views`; both in one frame. None for no views.
+///
+/// # Errors
+/// If a render or a metric is refused.
+pub fn score(cloud: &Cloud, views: &[View]) -> Result<Option<Scores>, Error> {
+    let scored = views
+        .iter()
+        .map(|view| {
+            let (w, h) = view.image.dimensions();
+            // As a viewer would see it: clamped to the range of a picture.
+            let render: Vec<f32> = render_view(cloud, &view.camera)?.iter().map(|x| x.clamp(0.0, 1.0)).collect();
+            let truth = composite(&view.image, WHITE);
+            Ok(ViewScore {
+                name: view.name.clone(),
+                psnr: psnr(&render, &truth)?,
+                ssim: ssim_3dgs(&render, &truth, w as usize, h as usize)?,
+            })
+        })
+        .collect::<Result<Vec<_>, Error>>()?;
+    if scored.is_empty() {
+        return Ok(None);
+    }
+    let mean = |f: fn(&ViewScore) -> f64| scored.iter().map(f).sum::<f64>() / scored.len() as f64;
+    Ok(Some(Scores { psnr: mean(|v| v.psnr), ssim: mean(|v| v.ssim), views: scored }))
+}

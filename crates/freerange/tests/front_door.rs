@@ -1,0 +1,209 @@
+//! The main job through the front door: what is told on the way, how it is stopped, what is refused.
+
+use std::{ops::ControlFlow, path::Path};
+
+use freerange::{
+    Camera, Device, Error, Options, Progress, Reconstructor, SampleConfig, Scene, Similarity, Stage, View, score,
+};
+use freerange_camera::Window;
+use glam::{DQuat, DVec3};
+
+fn model() -> Reconstructor {
+    Reconstructor::shipped(&Device::flex()).unwrap()
+}
+
+fn bowl() -> Vec<View> {
+    Scene::load(Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/bowl"))).unwrap().inputs
+}
+
+/// Quick to run, with every stage.
+fn short(model: &Reconstructor) -> Options {
+    let mut options = model.options().unwrap();
+    options.sample.start.as_mut().expect("the shipped model starts from a fit").fit.iterations = 20;
+    options.sample.steps = 3;
+    options.seeds = vec![4, 5];
+    options.sample.refine = 4;
+    options
+}
+
+fn go(_: &Progress<'_>) -> ControlFlow<()> {
+    ControlFlow::Continue(())
+}
+
+/// The scene in another frame: cameras moved, turned and scaled.
+fn elsewhere(views: &[View], to: &Similarity) -> Vec<View> {
+    views.iter().map(|v| View { camera: v.camera.transformed(to), ..v.clone() }).collect()
+}
+
+#[test]
+fn every_step_is_told_and_the_last_estimate_is_the_result_in_the_users_frame() {
+    let model = model();
+    let mut options = short(&model);
+    // Away from the canonical frame, where nothing that stays in it would agree with the cameras.
+    let to = Similarity { scale: 3.0, rotation: DQuat::from_rotation_z(0.4), translation: DVec3::new(5.0, -2.0, 1.0) };
+    let views = elsewhere(&bowl(), &to);
+    let mut told = Vec::new();
+    let mut estimates = Vec::new();
+    let result = model
+        .run(&views, &options, &mut |p| {
+            told.push((p.stage, p.sample, p.done, p.total));
+            let estimate = p.estimate().unwrap();
+            assert_eq!(estimate.is_some(), p.stage == Stage::Sample && p.done > 0);
+            assert_eq!(p.loss.is_some(), matches!(p.stage, Stage::Fit | Stage::Refine) && p.done > 0);
+            estimates.extend(estimate);
+            ControlFlow::Continue(())
+        })
+        .unwrap();
+    let steps = |stage, sample, total: usize| (0..=total).map(move |done| (stage, sample, done, total));
+    let expected: Vec<_> = [(Stage::Frame, 0, 0, 1)]
+        .into_iter()
+        .chain(steps(Stage::Fit, 0, 20))
+        .chain(steps(Stage::Sample, 0, 3))
+        .chain(steps(Stage::Refine, 0, 4))
+        .chain(steps(Stage::Refine, 1, 4))
+        .collect();
+    assert_eq!(told, expected);
+    assert_eq!(
+        result.seconds.iter().map(|s| s.0).collect::<Vec<_>>(),
+        [Stage::Frame, Stage::Fit, Stage::Sample, Stage::Refine]
+    );
+    let unrefined: Vec<_> = result.samples.iter().map(|s| s.unrefined.clone().unwrap()).collect();
+    assert!(estimates.len() == 3 && estimates[2] == unrefined && estimates[1] != unrefined);
+    assert_eq!(result.samples.iter().map(|s| s.seed).collect::<Vec<_>>(), [4, 5]);
+    assert_ne!(unrefined[0], unrefined[1]);
+    // In the frame of the cameras: what is seen there is the bowl.
+    for sample in &result.samples {
+        let found = score(&sample.gaussians, &views).unwrap().unwrap().psnr;
+        assert!(found > 18.0, "{found} dB");
+    }
+
+    // The same without anyone who looks.
+    assert_eq!(model.run(&views, &options, &mut go).unwrap().samples[1].gaussians, result.samples[1].gaussians);
+    options.sample.refine = 0;
+    let plain = model.run(&views, &options, &mut go).unwrap();
+    assert!(plain.samples.iter().all(|s| s.unrefined.is_none()));
+    assert_eq!(plain.samples[0].gaussians, unrefined[0]);
+}
+
+#[test]
+fn it_stops_where_it_is_told_to() {
+    let (model, views) = (model(), bowl());
+    let options = short(&model);
+    for (stage, done) in
+        [(Stage::Frame, 0), (Stage::Fit, 2), (Stage::Sample, 0), (Stage::Sample, 1), (Stage::Refine, 1)]
+    {
+        let mut after = 0;
+        let stopped = model.run(&views, &options, &mut |p| {
+            if (p.stage, p.done) == (stage, done) || after > 0 {
+                after += 1;
+                return ControlFlow::Break(());
+            }
+            ControlFlow::Continue(())
+        });
+        assert!(matches!(stopped, Err(Error::Cancelled)), "{stage} {done}");
+        assert_eq!(after, 1, "{stage} {done}: nothing is told any more");
+    }
+}
+
+#[test]
+fn what_cannot_be_used_is_named() {
+    let (model, views) = (model(), bowl());
+    let options = model.options().unwrap();
+    let refused = |views: &[View], options: &Options, words: &[&str]| {
+        let error = model.run(views, options, &mut |_| panic!("work was begun")).unwrap_err().to_string();
+        assert!(words.iter().all(|w| error.contains(w)), "{error}");
+    };
+    let change = |f: &dyn Fn(&mut View)| {
+        let mut views = views.clone();
+        f(&mut views[1]);
+        views
+    };
+    let name = views[1].name.as_str();
+    refused(&change(&|v| v.camera.width += 1), &options, &[name, "513 x 512", "512 x 512"]);
+    refused(&change(&|v| v.camera.fx = f64::NAN), &options, &[name, "camera"]);
+    refused(&change(&|v| v.camera = Camera { fy: 0.0, ..v.camera }), &options, &[name, "camera"]);
+    let with = |f: &dyn Fn(&mut Options)| {
+        let mut options = options.clone();
+        f(&mut options);
+        options
+    };
+    refused(&views, &with(&|o| o.sample.steps = 0), &["sample.steps"]);
+    refused(
+        &views,
+        &with(&|o| (o.without_network, o.sample) = (true, o.sample.clone().without_start())),
+        &["sample.start"],
+    );
+    let alone = model.run(&views[..1], &options, &mut go).unwrap_err().to_string();
+    assert!(alone.contains("at least 2 views"), "{alone}");
+    assert!(matches!(model.run(&views[..0], &options, &mut go), Err(Error::Camera(_))));
+    assert!(model.run(&views, &with(&|o| o.seeds.clear()), &mut go).unwrap().samples.is_empty());
+}
+
+#[test]
+fn threads_may_share_a_model() {
+    fn shared<T: Send + Sync>() {}
+    shared::<Reconstructor>();
+}
+
+/// The view on a larger sheet, transparent around it.
+fn on_a_sheet(view: &View, w: u32, h: u32, left: u32, top: u32) -> View {
+    let mut image = image::RgbaImage::new(w, h);
+    image::imageops::replace(&mut image, &view.image, left.into(), top.into());
+    let c = view.camera;
+    let camera = Camera { width: w, height: h, cx: c.cx + f64::from(left), cy: c.cy + f64::from(top), ..c };
+    View { name: view.name.clone(), camera, image }
+}
+
+#[test]
+fn photos_of_any_shape_and_size_are_seen_undistorted() {
+    let (model, bowl) = (model(), bowl());
+    let small = {
+        let image = freerange_camera::image_ops::resize_area(&bowl[2].image, 300, 300);
+        View { camera: bowl[2].camera.resized(300, 300), image, name: bowl[2].name.clone() }
+    };
+    let photos =
+        [on_a_sheet(&bowl[0], 700, 512, 150, 0), on_a_sheet(&bowl[1], 512, 640, 0, 30), small, bowl[3].clone()];
+    let squares = photos.each_ref().map(|v| Window::around(v).cut(v).into_owned());
+    assert_eq!(squares.each_ref().map(|v| v.image.dimensions()), [(512, 512), (512, 512), (300, 300), (512, 512)]);
+    let mut options = model.options().unwrap();
+    options.sample = SampleConfig { steps: 4, refine: 0, ..options.sample.without_start() };
+    let run = |views: &[View], options: &Options| model.run(views, options, &mut go).unwrap().samples.remove(0);
+    // What the network and its guidance see of a photo is what a square camera would have seen.
+    assert_eq!(run(&photos, &options).gaussians, run(&squares, &options).gaussians);
+    // Fit, sampling and refinement take them as they are, and the bowl is where the cameras saw it.
+    let mut options = short(&model);
+    options.sample.refine = 40;
+    let sample = run(&photos, &options);
+    let of = |cloud| score(cloud, &bowl).unwrap().unwrap().psnr;
+    let (before, after) = (of(sample.unrefined.as_ref().unwrap()), of(&sample.gaussians));
+    assert!(before > 18.0 && after > before, "{before} dB, refined {after} dB");
+}
+
+#[test]
+fn the_model_is_shown_as_many_views_as_it_knows() {
+    let model = model();
+    assert_eq!(model.views(), 6, "the shipped checkpoint learned from two to six");
+    let scene = Scene::load(Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/bowl"))).unwrap();
+    let mut views = scene.inputs.clone();
+    views.extend(scene.further);
+    assert!(views.len() > 6);
+    let mut options = short(&model);
+    options.sample.refine = 0;
+    options.seeds = vec![0];
+    let whole = model.run(&views, &options, &mut go).unwrap();
+    assert!(whole.shown.len() == 6 && whole.shown.is_sorted());
+    let note = whole.notes.iter().find(|n| n.contains("6 of")).unwrap();
+    assert!(whole.shown.iter().all(|&i| note.contains(&views[i].name)), "{note}");
+    options.views = Some(3);
+    let three = model.run(&views, &options, &mut go).unwrap();
+    assert_eq!(three.shown.len(), 3);
+    let alone: Vec<View> = three.shown.iter().map(|&i| views[i].clone()).collect();
+    options.views = None;
+    let found = model.run(&alone, &options, &mut go).unwrap();
+    assert_eq!((found.shown, &found.samples[0].gaussians), (vec![0, 1, 2], &three.samples[0].gaussians));
+    // Further views of one place say nothing new.
+    let doubled: Vec<View> = views.iter().take(4).cycle().take(12).cloned().collect();
+    assert_eq!(model.run(&doubled, &options, &mut go).unwrap().shown, [0, 1, 2, 3]);
+    options.views = Some(0);
+    assert!(model.run(&views, &options, &mut go).unwrap_err().to_string().contains("views"));
+}

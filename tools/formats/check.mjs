@@ -1,0 +1,182 @@
+#!/usr/bin/env node
+// One object in every format, read by readers that are not ours, and shown by them and by our page beside `freerange render`.
+//
+//     cd tools/formats && npm ci && python3 -m venv venv && venv/bin/pip install 'gsply[sogs,spz]==0.4.6'
+//     node --experimental-websocket check.mjs ../../target/release/freerange [FOLDER]
+//
+// Needs Chromium ($CHROMIUM, or `chromium` on the path). $PYTHON is the Python that has gsply; without it, gsply is left out, and said so.
+// Node 22 and later needs no option.
+import { execFileSync } from "node:child_process";
+import { existsSync, mkdirSync, mkdtempSync, readFileSync, writeFileSync } from "node:fs";
+import { tmpdir } from "node:os";
+import { join, resolve } from "node:path";
+import validator from "gltf-validator";
+import { browser, serve } from "./browser.mjs";
+import { difference, fromCsv, object, toPly, turned } from "./object.mjs";
+
+const [, , command, given] = process.argv;
+const here = new URL(".", import.meta.url).pathname, folder = resolve(given ?? mkdtempSync(join(tmpdir(), "formats-")));
+mkdirSync(folder, { recursive: true });
+let failed = 0;
+const check = (name, ok, found) => {
+  console.log(`${ok ? "ok    " : "FAILED"} ${name}: ${found}`);
+  failed += ok ? 0 : 1;
+};
+const run = (program, ...args) => execFileSync(program, args, { encoding: "utf8", maxBuffer: 1 << 28 });
+const file = (name) => join(folder, name);
+
+// The object, and its files.
+const gaussians = object(900), yUp = turned(gaussians, "x z -y");
+writeFileSync(file("object.ply"), toPly(gaussians));
+const FILES = ["written.ply", "object.splat", "object.spz", "object.sog", "object.glb", "view.html"];
+for (const name of FILES) run(command, "convert", file("object.ply"), file(name));
+run(command, "convert", file("object.ply"), file("version4.spz"), "--spz-version", "4");
+FILES.push("version4.spz");
+
+// What formats may lose: centres, log-scales, radians, opacity, colour. Half a step each, and a little for others' arithmetic.
+const LOSS = {
+  "written.ply": [1e-6, 1e-5, 1e-3, 1e-5, 1e-5],
+  "object.splat": [1e-6, 1e-5, 0.03, 0.0025, 0.0025],
+  "object.spz": [2e-6, 0.032, 0.006, 0.0025, 0.004],
+  "version4.spz": [2e-6, 0.032, 0.006, 0.0025, 0.004],
+  "object.sog": [6e-6, 0.01, 0.017, 0.0025, 0.004],
+};
+const compare = (reader, name, expected, found, loss = LOSS[name]) => {
+  const d = difference(expected, found), ok = Object.values(d).every((v, i) => v <= loss[i]);
+  check(`${reader} reads ${name}`, ok, Object.entries(d).map(([k, v]) => `${k} ${v.toExponential(1)}`).join(", "));
+};
+
+// splat-transform: takes .spz to the frame with -y up that it expects of .ply: (x, -y, -z) of +y up.
+const transform = join(here, "node_modules/@playcanvas/splat-transform/bin/cli.mjs");
+for (const name of Object.keys(LOSS)) {
+  run("node", transform, "-q", "-w", file(name), file(`${name}.csv`));
+  const frame = name.endsWith(".spz") ? turned(yUp, "x -y -z") : gaussians;
+  compare("splat-transform", name, frame, fromCsv(file(`${name}.csv`)));
+}
+
+// gsply: takes the numbers as they are.
+const python = process.env.PYTHON ?? join(here, "venv/bin/python");
+if (existsSync(python)) {
+  for (const name of Object.keys(LOSS).filter((n) => n !== "object.splat")) {
+    const found = JSON.parse(run(python, join(here, "read_gsply.py"), file(name)));
+    compare("gsply", name, name.endsWith(".spz") ? yUp : gaussians, found);
+  }
+} else console.log(`left out: gsply (no ${python})`);
+
+// The validator does not know the extension: one message per attribute of it, and no other.
+const report = await validator.validateBytes(new Uint8Array(readFileSync(file("object.glb"))));
+const known = (m) => m.code === "MESH_PRIMITIVE_INVALID_ATTRIBUTE" && m.pointer.includes("/KHR_gaussian_splatting:")
+  || m.code === "UNSUPPORTED_EXTENSION" && m.message.includes("KHR_gaussian_splatting");
+const others = report.issues.messages.filter((m) => !known(m));
+const attributes = report.issues.messages.filter((m) => m.code === "MESH_PRIMITIVE_INVALID_ATTRIBUTE").length;
+check("gltf-validator", others.length === 0 && attributes === 4 && !report.issues.truncated,
+  others.map((m) => `${m.code} ${m.pointer}: ${m.message}`).join("; ") || "nothing but the four attributes of the extension");
+
+// Pictures: ours first.
+const WIDTH = 480, HEIGHT = 560;
+const eye = [0.75, -0.6, 0.5], target = [0.12, 0.08, 0.05], fov = 40, toYUp = ([x, y, z]) => [x, z, -y];
+const psnr = (a, b) => {
+  let sum = 0, n = 0;
+  a.forEach((v, i) => { if (i % 4 < 3) { sum += (v - b[i]) ** 2; n += 1; } });
+  return 10 * Math.log10(255 ** 2 * n / sum);
+};
+const bytes = (base64) => new Uint8Array(Buffer.from(base64, "base64"));
+const server = await serve({ modules: join(here, "node_modules"), files: folder, page: here });
+const chromium = await browser(WIDTH, HEIGHT);
+try {
+  const address = `file://${file("view.html")}#eye=${eye}&target=${target}&fov=${fov}`;
+  await chromium.send("Emulation.setEmulatedMedia", { features: [{ name: "prefers-color-scheme", value: "light" }] });
+  await chromium.send("Network.enable");
+  await chromium.send("Network.emulateNetworkConditions", { offline: true, latency: 0, downloadThroughput: 0, uploadThroughput: 0 });
+  await chromium.open(address);
+  await chromium.until("window.viewer?.frames > 0");
+  const size = await chromium.evaluate("[viewer.canvas.clientWidth, viewer.canvas.clientHeight]");
+  const view = { width: size[0], height: size[1], fov };
+  const shot = async () => {
+    await chromium.evaluate("viewer.draw()");
+    const clip = { x: 0, y: 0, ...view, scale: 1 };
+    const { data } = await chromium.send("Page.captureScreenshot", { format: "png", clip });
+    return data;
+  };
+  const picture = await shot();
+  writeFileSync(file("view.png"), Buffer.from(picture, "base64"));
+  check("view.html offline", chromium.errors.length === 0, chromium.errors.join("; ") || "no errors");
+  // Keys, buttons, dark.
+  const state = "JSON.stringify([viewer.orbit.azimuth, viewer.orbit.elevation, viewer.orbit.distance].map((v) => v.toFixed(4)))";
+  const before = await chromium.evaluate(state);
+  await chromium.evaluate("viewer.canvas.focus()");
+  for (const key of ["ArrowLeft", "ArrowUp", "+"]) {
+    const code = { ArrowLeft: 37, ArrowUp: 38, "+": 187 }[key];
+    await chromium.send("Input.dispatchKeyEvent", { type: "keyDown", key, windowsVirtualKeyCode: code, text: key === "+" ? "+" : undefined });
+    await chromium.send("Input.dispatchKeyEvent", { type: "keyUp", key, windowsVirtualKeyCode: code });
+  }
+  const keyed = JSON.parse(await chromium.evaluate(state)), at = JSON.parse(before);
+  check("view.html, keys", keyed.every((v, i) => v !== at[i]), `${at} to ${keyed}`);
+  const mouse = (type, x, y) => chromium.send("Input.dispatchMouseEvent", { type, x, y, button: "left", buttons: type === "mouseReleased" ? 0 : 1, clickCount: 1 });
+  await mouse("mousePressed", 100, 100);
+  await mouse("mouseMoved", 150, 120);
+  await mouse("mouseReleased", 150, 120);
+  const dragged = JSON.parse(await chromium.evaluate(state));
+  check("view.html, mouse", dragged[0] !== keyed[0] && dragged[1] !== keyed[1] && dragged[2] === keyed[2], `${keyed} to ${dragged}`);
+  await chromium.send("Emulation.setTouchEmulationEnabled", { enabled: true, maxTouchPoints: 2 });
+  const touch = (type, ...points) => chromium.send("Input.dispatchTouchEvent", { type, touchPoints: points.map(([x, y], id) => ({ x, y, id })) });
+  await touch("touchStart", [200, 200], [260, 200]);
+  await touch("touchMove", [180, 200], [300, 200]);
+  await touch("touchEnd");
+  const pinched = JSON.parse(await chromium.evaluate(state));
+  check("view.html, two fingers", Number(pinched[2]) < Number(dragged[2]), `distance ${dragged[2]} to ${pinched[2]}`);
+  await chromium.evaluate("document.querySelector('[data-do=reset]').click(); document.querySelector('[data-do=background]').click()");
+  const dark = await chromium.evaluate("[viewer.background[0] < 0.2, JSON.stringify(viewer.orbit) === JSON.stringify(viewer.home)].join()");
+  check("view.html, reset and dark", dark === "true,true", dark);
+  const tree = await chromium.send("Accessibility.getFullAXTree");
+  const named = tree.nodes.filter((n) => n.role?.value === "button").map((n) => n.name?.value);
+  check("view.html, names", named.length === 8 && named.every((n) => n?.length > 1), named.join(", "));
+  await chromium.send("Network.emulateNetworkConditions", { offline: false, latency: 0, downloadThroughput: -1, uploadThroughput: -1 });
+
+  // The same camera for `freerange render`: columns are right, up, back, eye.
+  const minus = (a, b) => a.map((v, i) => v - b[i]), norm = (a) => a.map((v) => v / Math.hypot(...a));
+  const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+  const back = norm(minus(eye, target)), right = norm(cross([0, 0, 1], back)), up = cross(back, right);
+  const focal = view.height / 2 / Math.tan(fov * Math.PI / 360);
+  const matrix = [0, 1, 2].map((k) => [right[k], up[k], back[k], eye[k]]).concat([[0, 0, 0, 1]]);
+  const camera = { w: view.width, h: view.height, fl_x: focal, fl_y: focal, cx: view.width / 2, cy: view.height / 2 };
+  writeFileSync(file("cameras.json"), JSON.stringify({ ...camera, frames: [{ file_path: "ours", transform_matrix: matrix }] }));
+  run(command, "render", file("object.ply"), "--cameras", file("cameras.json"), "-o", file("renders"));
+
+  await chromium.open(`${server.url}/page/readers.html`);
+  await chromium.until("window.ready");
+  const decode = async (name) => bytes((await chromium.evaluate(`decode("/files/${name}")`)).data);
+  const ours = await decode("renders/ours.png");
+  const shown = (name, data, least, other = ours, what = "freerange render") => {
+    const db = psnr(other, data);
+    check(`${name} beside ${what}`, db >= least, `${db.toFixed(1)} dB`);
+  };
+  shown("view.html", await decode("view.png"), 30);
+  const upright = { ...view, eye: toYUp(eye), target: toYUp(target), up: [0, 1, 0] }, zUp = { ...view, eye, target, up: [0, 0, 1] };
+  // three.js ends Gaussians at two standard deviations and lets thin ones fade: its own files agree with each other far better.
+  let first;
+  for (const [reader, name] of [
+    ["three", "object.glb"], ["three", "object.spz"], ["three", "version4.spz"],
+    ["spark", "object.spz"], ["spark", "object.splat"], ["spark", "object.sog"], ["spark", "written.ply"],
+  ]) {
+    const inYUp = /\.(glb|spz)$/.test(name);
+    const call = { ...(inYUp ? upright : zUp), url: `/files/${name}` };
+    const { data, positions, gaussians: found } = await chromium.evaluate(`${reader}(${JSON.stringify(call)})`);
+    writeFileSync(file(`${reader}-${name}.rgba`), bytes(data));
+    shown(`${reader}, ${name}`, bytes(data), reader === "three" ? 25 : 30);
+    if (reader === "three" && first) shown(`${reader}, ${name}`, bytes(data), 38, first, "its object.glb");
+    first ??= bytes(data);
+    if (positions) {
+      const apart = Math.max(...yUp.flatMap((g, i) => g.mean.map((v, k) => Math.abs(v - positions[3 * i + k]))));
+      check(`${reader} reads ${name}`, apart <= LOSS[name][0], `centres ${apart.toExponential(1)}`);
+    }
+    // Spark itself keeps 16-bit floats, 8 bits of log-scale, opacity and colour, and of rotations two of an octahedron and one of the angle.
+    const kept = [2e-4, 0.045, 0.035, 0.0025, 0.003];
+    if (found) compare(reader, name, inYUp ? yUp : gaussians, found, LOSS[name].map((v, k) => v + kept[k]));
+  }
+} finally {
+  await chromium.close();
+  server.close();
+}
+console.log(failed ? `${failed} checks failed; files are in ${folder}` : "all agree");
+process.exit(failed ? 1 : 0);

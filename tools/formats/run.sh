@@ -1,0 +1,30 @@
+#!/usr/bin/env bash
+# check.mjs with all it needs: Node 20 or later, Chromium, other people's readers from npm and PyPI. Says what it leaves out where these cannot be had.
+#
+#     tools/formats/run.sh target/release/freerange
+set -euo pipefail
+binary=$(realpath "$1")
+cd "$(dirname "$0")"
+leave() {
+  echo "LEFT OUT: formats in other programs' readers: $*"
+  exit 0
+}
+node -e 'process.exit(Number(process.versions.node.split(".")[0]) >= 20 ? 0 : 1)' 2>/dev/null || leave "no Node of version 20 or later"
+if [ -z "${CHROMIUM:-}" ]; then
+  CHROMIUM=$(command -v chromium || command -v chromium-browser || command -v google-chrome || true)
+  if [ -z "$CHROMIUM" ]; then
+    { apt-get update -q && apt-get install -q -y --no-install-recommends chromium; } || leave "no Chromium"
+    CHROMIUM=chromium
+  fi
+fi
+export CHROMIUM
+if [ ! -d node_modules ]; then
+  npm ci --no-audit --no-fund --ignore-scripts || leave "no packages from npm"
+fi
+# Of the Python reader the check itself says that it is left out.
+if [ -z "${PYTHON:-}" ] && [ ! -d venv ]; then
+  { python3 -m venv venv && venv/bin/pip install -q 'gsply[sogs,spz]==0.4.6'; } || rm -rf venv
+fi
+options=()
+node -e 'process.exit(typeof WebSocket === "undefined" ? 1 : 0)' || options+=(--experimental-websocket)
+node "${options[@]}" check.mjs "$binary"
