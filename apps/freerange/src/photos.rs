@@ -5,9 +5,10 @@ use std::{path::Path, str::FromStr};
 use freerange::{FrameConfig, Up};
 use freerange_scene::{
     LoadConfig, Loaded, MaskSource,
-    estimate::{Hints, table_faces},
+    estimate::Hints,
     load,
     read::{Cameras, Format, Turntable, cameras},
+    up_of,
 };
 use glam::DVec3;
 
@@ -127,18 +128,13 @@ impl Photos {
         };
         let loaded = load(&cameras, &config)?;
         let mut notes: Vec<String> = cameras.notes.iter().chain(&loaded.notes).cloned().collect();
-        let up = match (up, cameras.format) {
-            (UpChoice::Told(up), _) => up,
-            (UpChoice::Auto, Format::Colmap | Format::Metashape) => {
-                let table = match &loaded.estimate {
-                    Some(estimate) => estimate.up,
-                    None => table_faces(&loaded.views, &loaded.whole),
-                };
-                let whence = if table.is_some() { "what the object stands on" } else { "the cameras" };
-                notes.push(format!("up is taken from {whence}; --up says otherwise"));
-                table.map_or(Up::Cameras, Up::Direction)
+        let up = match up {
+            UpChoice::Told(up) => up,
+            UpChoice::Auto => {
+                let (up, note) = up_of(&cameras, &loaded);
+                notes.extend(note);
+                up
             }
-            (UpChoice::Auto, _) => Up::Z,
         };
         let frame = FrameConfig { up, center: self.center, radius: self.radius, ..FrameConfig::default() };
         Ok(Scene { cameras, loaded, frame, notes })

@@ -26,7 +26,7 @@ pub fn refine(
     cloud: &Cloud,
     views: &[View],
     config: &RefineConfig,
-    progress: impl FnMut(&FitProgress) -> ControlFlow<()>,
+    progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Cloud, FitError> {
     config.check()?;
     let targets = Targets::new(views, config.render_size)?;
