@@ -57,6 +57,10 @@ pub struct SampleConfig {
     pub compute: Compute,
     /// Steps of 3DGS-MCMC on the input views that follow ([`freerange_fit::refine`]); [`reconstruct`] itself takes none.
     pub refine: usize,
+    /// How many samples refinement is held at the mean pictures of, each from a fit and noise of its own; what is refined is the
+    /// first. [`reconstruct`] itself draws what it is asked for.
+    #[serde(skip_serializing_if = "is_one")]
+    pub ensemble: usize,
     /// What is different where a model that starts from fits by itself is asked to start from pure noise; left out: nothing.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub from_noise: Option<FromNoise>,
@@ -92,9 +96,14 @@ impl Default for SampleConfig {
             coupling: Coupling::Independent,
             compute: Compute::F32,
             refine: 0,
+            ensemble: 1,
             from_noise: None,
         }
     }
+}
+
+fn is_one(x: &usize) -> bool {
+    *x == 1
 }
 
 impl SampleConfig {
@@ -120,6 +129,9 @@ impl SampleConfig {
         }
         if self.refine > 100_000 {
             return bad("refine", "0 to 100000", self.refine.to_string());
+        }
+        if !(1..=64).contains(&self.ensemble) {
+            return bad("ensemble", "1 to 64", self.ensemble.to_string());
         }
         if self.solver == Solver::Hold && self.start.is_none() {
             return bad("solver", "euler, heun or multistep without sample.start", "hold".into());

@@ -154,13 +154,18 @@ impl Reconstructor {
         seconds.push((Stage::Frame, begin.elapsed().as_secs_f64()));
 
         let begin = Instant::now();
-        let fit = match &options.sample.start {
-            None => None,
-            Some(start) => {
-                let mut fit =
-                    watched(Stage::Fit, 0, &mut tell, start.fit.iterations, |p| quick_fit(&shown, &start.fit, 0, p))?;
+        // Samples that nothing is made of have no use for others beside them.
+        let members = if options.sample.refine > 0 { options.sample.ensemble } else { 1 };
+        let mut fits = Vec::new();
+        if let Some(start) = &options.sample.start {
+            let total = start.fit.iterations * members;
+            for member in 0..members {
+                let before = start.fit.iterations * member;
+                let mut fit = watched(Stage::Fit, 0, &mut tell, before, total, |p| {
+                    quick_fit(&shown, &start.fit, member as u64, p)
+                })?;
                 // The fit knows better than the masks where the object is; it moves along, so that one is enough.
-                if !frame.kept {
+                if member == 0 && !frame.kept {
                     let correction = frame_of(&fit, &shown)?;
                     fit.transform(correction.scale, correction.rotation, correction.translation);
                     canonical = moved(&canonical, &correction);
@@ -169,42 +174,61 @@ impl Reconstructor {
                     let (shift, scale) = (correction.translation.length(), correction.scale);
                     frame.notes.push(format!("the quick fit moved it by {shift:.3} and scaled it by {scale:.3}"));
                 }
-                seconds.push((Stage::Fit, begin.elapsed().as_secs_f64()));
-                Some(fit)
+                fits.push(fit);
             }
-        };
+            seconds.push((Stage::Fit, begin.elapsed().as_secs_f64()));
+        }
         let canonical_from_user = frame.canonical_from_user;
 
         let begin = Instant::now();
-        let clouds = match (&fit, options.without_network) {
-            (Some(fit), true) => {
-                let slice = tree_slice(fit, options.sample.depth.unwrap_or(self.checkpoint.depth))?;
-                vec![slice; options.seeds.len()]
+        // [seeds][members]
+        let clouds: Vec<Vec<Cloud>> = match options.without_network && !fits.is_empty() {
+            true => {
+                let depth = options.sample.depth.unwrap_or(self.checkpoint.depth);
+                let slices = fits.iter().map(|fit| tree_slice(fit, depth)).collect::<Result<Vec<_>, _>>()?;
+                vec![slices; options.seeds.len()]
             }
-            _ => {
+            false => {
                 let total = options.sample.steps;
                 tell(&Progress::new(Stage::Sample, 0, total))?;
-                let fits = fit.as_ref().map(std::slice::from_ref);
-                let (config, seeds) = (&options.sample, &options.seeds);
-                let sampled =
-                    reconstruct(&self.checkpoint, &[&shown], fits, config, seeds, &self.device, |estimate| {
-                        let told = Progress::new(Stage::Sample, estimate.index + 1, total);
-                        let told = Progress { estimate: Some((estimate, &canonical_from_user)), ..told };
-                        tell(&told).map_or(ControlFlow::Break(()), ControlFlow::Continue)
-                    })?;
-                sampled.into_iter().flatten().collect()
+                // Members are the same object with other fits and other noise. Those that are nothing but helpers draw from
+                // far away, so that the first is what it is without them.
+                let seeds: Vec<u64> = (0..members as u64)
+                    .flat_map(|member| options.seeds.iter().map(move |seed| seed.wrapping_add(member << 32)))
+                    .collect();
+                let mut sampled = Vec::with_capacity(seeds.len()); // [members][seeds], flat
+                let per_member: Vec<(Option<&[Cloud]>, &[u64])> = match fits.is_empty() {
+                    true => vec![(None, &seeds)],
+                    false => fits.chunks(1).map(Some).zip(seeds.chunks(options.seeds.len())).collect(),
+                };
+                for (member, (fits, seeds)) in per_member.into_iter().enumerate() {
+                    let config = &options.sample;
+                    let made =
+                        reconstruct(&self.checkpoint, &[&shown], fits, config, seeds, &self.device, |estimate| {
+                            let told = Progress::new(Stage::Sample, estimate.index + 1, total);
+                            let told = Progress { estimate: Some((estimate, &canonical_from_user)), ..told };
+                            let told = if member == 0 { tell(&told) } else { Ok(()) };
+                            told.map_or(ControlFlow::Break(()), ControlFlow::Continue)
+                        })?;
+                    sampled.extend(made.into_iter().flatten());
+                }
+                let of_seed = |i: usize| sampled.iter().skip(i).step_by(options.seeds.len()).cloned().collect();
+                (0..options.seeds.len()).map(of_seed).collect()
             }
         };
         seconds.push((Stage::Sample, begin.elapsed().as_secs_f64()));
 
         let begin = Instant::now();
         let mut samples = Vec::with_capacity(clouds.len());
-        for (i, (&seed, plain)) in options.seeds.iter().zip(clouds).enumerate() {
+        for (i, (&seed, mut members)) in options.seeds.iter().zip(clouds).enumerate() {
+            let plain = members.remove(0);
             let refined = match options.sample.refine {
                 0 => None,
                 steps => {
                     let config = RefineConfig { steps, seed, ..RefineConfig::default() };
-                    Some(watched(Stage::Refine, i, &mut tell, steps, |p| refine(&plain, &canonical, &config, p))?)
+                    Some(watched(Stage::Refine, i, &mut tell, 0, steps, |p| {
+                        refine(&plain, &members, &canonical, &config, p)
+                    })?)
                 }
             };
             let (canonical, unrefined) = match refined {
@@ -246,18 +270,19 @@ pub fn choose_views(views: &[View], most: usize) -> Result<Vec<usize>, Error> {
     }
 }
 
-/// A fit whose steps are told; what it has when it is stopped is of no use.
+/// A fit whose steps are told, `before` and on; what it has when it is stopped is of no use.
 fn watched(
     stage: Stage,
     sample: usize,
     tell: &mut impl FnMut(&Progress<'_>) -> Result<(), Error>,
+    before: usize,
     total: usize,
     fit: impl FnOnce(&mut dyn FnMut(&FitProgress) -> ControlFlow<()>) -> Result<Cloud, freerange_fit::FitError>,
 ) -> Result<Cloud, Error> {
-    tell(&Progress { sample, ..Progress::new(stage, 0, total) })?;
+    tell(&Progress { sample, ..Progress::new(stage, before, total) })?;
     let mut stopped = Ok(());
     let cloud = fit(&mut |p| {
-        stopped = tell(&Progress { sample, loss: Some(p.loss), ..Progress::new(stage, p.step, total) });
+        stopped = tell(&Progress { sample, loss: Some(p.loss), ..Progress::new(stage, before + p.step, total) });
         if stopped.is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
     });
     stopped?;
