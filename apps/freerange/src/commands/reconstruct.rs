@@ -72,6 +72,9 @@ pub struct Sampling {
     /// Hold that refinement at the mean pictures of so many samples; 1 is the sample alone [default: the checkpoint's].
     #[arg(long, value_name = "SAMPLES", value_parser = clap::value_parser!(u8).range(1..=64))]
     pub ensemble: Option<u8>,
+    /// Mend a sample from pure noise in so many passes, as fits are mended; 0 is none [default: the checkpoint's].
+    #[arg(long, value_name = "PASSES")]
+    pub mend: Option<usize>,
     /// Seed of the (first) sample.
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
@@ -153,6 +156,7 @@ impl Sampling {
         sample.solver = self.solver.unwrap_or(sample.solver);
         sample.compute = self.compute.unwrap_or(sample.compute);
         sample.refine = self.refine.unwrap_or(sample.refine);
+        sample.mend = self.mend.unwrap_or(sample.mend);
         sample.ensemble = self.ensemble.map_or(sample.ensemble, usize::from);
         options.seeds = (0..u64::from(samples)).map(|i| self.seed.wrapping_add(i)).collect();
         options.frame.up = self.up.or_z();
