@@ -444,7 +444,7 @@ impl Board {
             }
             (job.folder.clone(), job.record.up, job.record.title.clone())
         };
-        let cloud = read_ply(&sample_file(&folder, i)).map_err(Refusal::own)?;
+        let cloud = read_ply(&sample_file(&folder, i)).map_err(Refusal::own)?.cloud;
         let frame = Frame::with_up(DVec3::from_array(up)).unwrap_or_default();
         let options = WriteOptions { frame, ..WriteOptions::default() };
         let encoded = freerange_formats::encode(&cloud, format, &options).map_err(Refusal::own)?;
@@ -464,7 +464,7 @@ impl Board {
             }
             job.folder.clone()
         };
-        Ok(bytes(&read_ply(&sample_file(&folder, i)).map_err(Refusal::own)?))
+        Ok(bytes(&read_ply(&sample_file(&folder, i)).map_err(Refusal::own)?.cloud))
     }
 
     /// Ends: whoever waits hears of it, whoever computes stops.

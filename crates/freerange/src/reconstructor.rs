@@ -10,7 +10,11 @@ use freerange_model::Checkpoint;
 use freerange_splat::Cloud;
 use glam::DQuat;
 
-use crate::{EncoderPlaces, Error, Options, Progress, Stage, load_checkpoint, require};
+use crate::{
+    EncoderPlaces, Error, Options, Progress, Stage, load_checkpoint,
+    progress::{Known, Place},
+    require,
+};
 
 /// A model on a device, ready to reconstruct one object after the other.
 #[derive(Clone, Debug)]
@@ -163,8 +167,10 @@ impl Reconstructor {
             for member in 0..members {
                 let done = [member * config.iterations, members * config.iterations];
                 let seed = member as u64;
+                let Turned { views, back } = &turned[member];
+                let place = Place { back, canonical_from_user: &frame.canonical_from_user };
                 let mut fit =
-                    watched(Stage::Fit, 0, &mut tell, done, |p| quick_fit(&turned[member].views, config, seed, p))?;
+                    watched(Stage::Fit, 0, place, &mut tell, done, |p| quick_fit(views, config, seed, p))?;
                 // The fit knows better than the masks where the object is; it moves along, so that one is enough.
                 if member == 0 && !frame.kept {
                     let correction = frame_of(&fit, &turned[0].views)?;
@@ -182,15 +188,14 @@ impl Reconstructor {
         let canonical_from_user = frame.canonical_from_user;
 
         let begin = Instant::now();
-        tell(&Progress::new(Stage::Sample, 0, options.sample.steps))?;
+        let (steps, total) = (options.sample.steps, members * options.sample.steps);
+        tell(&Progress::new(Stage::Sample, 0, total))?;
         let mut clouds = vec![Vec::with_capacity(members); options.seeds.len()]; // [seeds][members]
         for (member, turned) in turned.iter().enumerate() {
-            let told = |estimate: &Estimate<'_>| match member {
-                0 => {
-                    let told = Progress::new(Stage::Sample, estimate.index + 1, options.sample.steps);
-                    tell(&Progress { estimate: Some((estimate, &canonical_from_user)), ..told })
-                }
-                _ => Ok(()),
+            let place = Place { back: &turned.back, canonical_from_user: &canonical_from_user };
+            let told = |estimate: &Estimate<'_>| {
+                let told = Progress::new(Stage::Sample, member * steps + estimate.index + 1, total);
+                tell(&Progress { estimate: Some((Known::Sampled(estimate), place)), ..told })
             };
             let sampled = self.sample(&turned.views, fits.get(member), options, member as u64, told)?;
             clouds.iter_mut().zip(sampled).for_each(|(members, cloud)| members.push(turned.back(cloud)));
@@ -211,8 +216,9 @@ impl Reconstructor {
                     };
                     let config = RefineConfig { steps, hold, seed, ..RefineConfig::default() };
                     let refined =
-                        |p: &mut dyn FnMut(&FitProgress) -> _| refine(&plain, &members, &canonical, &config, p);
-                    Some(watched(Stage::Refine, i, &mut tell, [0, steps], refined)?)
+                        |p: &mut dyn FnMut(&FitProgress<'_>) -> _| refine(&plain, &members, &canonical, &config, p);
+                    let place = Place { back: &Similarity::IDENTITY, canonical_from_user: &canonical_from_user };
+                    Some(watched(Stage::Refine, i, place, &mut tell, [0, steps], refined)?)
                 }
             };
             let (canonical, unrefined) = match refined {
@@ -320,14 +326,16 @@ pub fn choose_views(views: &[View], most: usize) -> Result<Vec<usize>, Error> {
 fn watched(
     stage: Stage,
     sample: usize,
+    place: Place<'_>,
     tell: &mut impl FnMut(&Progress<'_>) -> Result<(), Error>,
     [before, total]: [usize; 2],
-    fit: impl FnOnce(&mut dyn FnMut(&FitProgress) -> ControlFlow<()>) -> Result<Cloud, freerange_fit::FitError>,
+    fit: impl FnOnce(&mut dyn FnMut(&FitProgress<'_>) -> ControlFlow<()>) -> Result<Cloud, freerange_fit::FitError>,
 ) -> Result<Cloud, Error> {
     tell(&Progress { sample, ..Progress::new(stage, before, total) })?;
     let mut stopped = Ok(());
     let cloud = fit(&mut |p| {
-        stopped = tell(&Progress { sample, loss: Some(p.loss), ..Progress::new(stage, before + p.step, total) });
+        let (loss, estimate) = (Some(p.loss), Some((Known::Fitted(p.cloud), place)));
+        stopped = tell(&Progress { sample, loss, estimate, ..Progress::new(stage, before + p.step, total) });
         if stopped.is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
     });
     stopped?;
