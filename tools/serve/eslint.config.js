@@ -14,6 +14,7 @@ export default [
     },
     rules: { eqeqeq: "error", "no-implicit-globals": "off", "no-var": "error", "prefer-const": "error", "no-eval": "error", "no-unused-vars": ["error", { varsIgnorePattern: "^Viewer$" }] },
   },
+  { files: ["**/*.mjs"], languageOptions: { globals: names("process URL console setTimeout fetch Buffer") } },
   {
     // The viewer defines what the page uses.
     files: ["**/viewer.js"],

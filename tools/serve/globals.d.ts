@@ -8,7 +8,8 @@ declare class Viewer {
   camera: Pinhole | null;
   orbit: Orbit;
   near: number;
-  count?: number;
+  count: number;
+  rows: Float32Array;
   frames: number;
   onmove: ((viewer: Viewer) => void) | null;
   ondraw: ((viewer: Viewer) => void) | null;

@@ -24,6 +24,7 @@ for folder in . ../formats; do
   [ -d "$folder/node_modules" ] || (cd "$folder" && npm ci --no-audit --no-fund --ignore-scripts) || leave "no packages from npm"
 done
 npx tsc -p tsconfig.json
+npx tsc -p tsconfig.viewer.json
 # ESLint does not look above its own folder.
 trap 'rm -rf linted' EXIT
 mkdir -p linted

@@ -39,6 +39,7 @@ const THUMBNAIL: u32 = 160;
 /// Gaussians that a run has published.
 struct Estimate {
     number: u64,
+    stage: &'static str,
     /// Sample and rows, little-endian.
     parts: Vec<(usize, Arc<Vec<u8>>)>,
 }
@@ -78,7 +79,7 @@ pub struct Board {
     root: PathBuf,
     temporary: Mutex<Option<tempfile::TempDir>>,
     keeps: bool,
-    _lock: File,
+    lock: File,
     limits: Limits,
     engine: Arc<dyn Engine>,
     table: Mutex<Table>,
@@ -158,7 +159,7 @@ impl Board {
             keeps: keep.is_some(),
             root,
             temporary: Mutex::new(temporary),
-            _lock: lock,
+            lock,
             limits,
             engine,
             table: Mutex::default(),
@@ -249,6 +250,7 @@ impl Board {
         // Masks are also looked for some folders above the photos: there has to be nothing else.
         let upload = uploads(&folder).join("0/0/0");
         fs::create_dir_all(&upload).map_err(Refusal::own)?;
+        table.turns += 1;
         let record = Record {
             id: id.clone(),
             title: String::new(),
@@ -257,7 +259,7 @@ impl Board {
             error: None,
             scene: SceneOptions::default(),
             options: JobOptions::default(),
-            turn: 0,
+            turn: table.turns,
             understood: Value::Null,
             passed_over: Vec::new(),
             samples: Vec::new(),
@@ -295,7 +297,9 @@ impl Board {
             "samples": r.samples, "up": r.up, "may_go": r.state.may_go() && scene::is_whole(&job.folder),
             "formats": Format::ALL.map(|f| f.extension()),
         });
-        value.as_object_mut().expect("a status has fields").append(&mut { more }.as_object_mut().expect("fields").clone());
+        if let (Some(fields), Value::Object(mut more)) = (value.as_object_mut(), more) {
+            fields.append(&mut more);
+        }
         Ok(value)
     }
 
@@ -304,7 +308,7 @@ impl Board {
         let table = self.table();
         let waiting = table.waiting();
         let mut jobs: Vec<&Job> = table.jobs.values().filter(|j| j.record.state != State::Uploading).collect();
-        jobs.sort_by_key(|j| (std::cmp::Reverse(j.record.created), j.record.id.clone()));
+        jobs.sort_by_key(|j| std::cmp::Reverse((j.record.created, j.record.turn)));
         jobs.iter().map(|j| j.status(&waiting)).collect()
     }
 
@@ -481,6 +485,10 @@ impl Board {
         if let Some(Err(e)) = folder.map(tempfile::TempDir::close) {
             tracing::warn!("{}: {e}", self.root.display());
         }
+        // Threads of slow clients may live a little longer than the server.
+        if let Err(e) = self.lock.unlock() {
+            tracing::warn!("{}: {e}", self.root.display());
+        }
     }
 
     /// The next job in `state`; none when the server ends.
@@ -518,7 +526,11 @@ impl Board {
             };
             let told = self.change(&id, |job| {
                 if cancel.load(Relaxed) || job.record.state != State::Reading {
-                    return Ok(()); // someone was faster
+                    // Someone was faster; what was read is there all the same.
+                    if let Ok(understood) = read {
+                        job.record.understood = understood;
+                    }
+                    return Ok(());
                 }
                 match read {
                     Ok(understood) => {
@@ -667,7 +679,7 @@ impl Board {
             if job.estimates.len() == ESTIMATES {
                 job.estimates.pop_front();
             }
-            job.estimates.push_back(Estimate { number: job.published, parts });
+            job.estimates.push_back(Estimate { number: job.published, stage, parts });
         }
         self.changed.notify_all();
     }
@@ -733,7 +745,7 @@ impl Job {
         let running = r.state == State::Running;
         let estimate = self.estimates.back().map(|e| {
             let parts: Vec<_> = e.parts.iter().map(|(s, rows)| json!({ "sample": s, "gaussians": rows.len() / ROW })).collect();
-            json!({ "number": e.number, "parts": parts })
+            json!({ "number": e.number, "stage": e.stage, "parts": parts })
         });
         json!({
             "id": r.id, "title": r.title, "created": r.created, "state": r.state, "error": r.error,

@@ -81,6 +81,7 @@ impl Request {
 
     fn parse(stream: &TcpStream, patience: Patience) -> Result<Option<Head>, Refusal> {
         let deadline = Instant::now() + patience.head;
+        let large = || Refusal::new(431, format!("the head is larger than {HEAD} bytes"));
         let mut bytes = Vec::new();
         let mut chunk = [0; 4096];
         let end = loop {
@@ -94,9 +95,12 @@ impl Request {
                 break from + at + 4;
             }
             if bytes.len() > HEAD {
-                return Err(Refusal::new(431, format!("the head is larger than {HEAD} bytes")));
+                return Err(large());
             }
         };
+        if end > HEAD {
+            return Err(large());
+        }
         let mut slots = [httparse::EMPTY_HEADER; HEADERS];
         let mut parsed = httparse::Request::new(&mut slots);
         let malformed = |e: &dyn std::fmt::Display| Refusal::new(400, format!("malformed request: {e}"));

@@ -154,7 +154,9 @@ impl<'a> Upload<'a> {
 
 /// Width and height, from the head alone.
 fn picture_size(path: &Path) -> Result<(u32, u32), String> {
-    let reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(|e| e.to_string())?;
+    // By its bytes: a name proves nothing.
+    let file = std::io::BufReader::new(File::open(path).map_err(|e| e.to_string())?);
+    let reader = ImageReader::new(file).with_guessed_format().map_err(|e| e.to_string())?;
     match reader.format() {
         Some(ImageFormat::Png | ImageFormat::Jpeg | ImageFormat::WebP) => {}
         _ => return Err("expected the bytes of a PNG, JPEG or WebP, found others".into()),

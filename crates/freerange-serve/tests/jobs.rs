@@ -49,8 +49,11 @@ fn the_example_becomes_gaussians_while_one_watches() {
     let options = engine.seen.lock().unwrap()[0].2;
     assert_eq!((options.samples, options.seed, options.refine), (Some(2), Some(3), None));
     let expected = Fake::cloud(4, 8);
+    // Colours are rounded in files.
+    let alike = |rows: &[f32]| rows.iter().zip(expected.rows()).all(|(a, b)| (a - b).abs() < 1e-6);
     let rows = server.get(&format!("/jobs/{id}/samples/1")).body;
-    assert_eq!(rows, expected.rows().iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<_>>());
+    let rows: Vec<f32> = rows.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
+    assert!(rows.len() == 40 * 14 && alike(&rows));
     for format in Format::ALL {
         let reply = server.get(&format!("/jobs/{id}/samples/1.{format}"));
         assert_eq!(reply.headers["content-disposition"], format!("attachment; filename=\"bowl-1.{format}\""));
@@ -58,7 +61,7 @@ fn the_example_becomes_gaussians_while_one_watches() {
         let read = parse(format, &reply.body, name.as_ref(), Frame::Z_UP).unwrap();
         assert_eq!(read.cloud.len(), 40, "{format}");
         if format == Format::Ply {
-            assert_eq!(read.cloud, expected);
+            assert!(alike(read.cloud.rows()));
         }
     }
     for (path, size) in [("thumbnail.png", (160, 160)), ("photos/0.png", (512, 512)), ("views/3.png", (512, 512))] {
@@ -80,16 +83,16 @@ fn the_example_becomes_gaussians_while_one_watches() {
 fn photos_are_looked_at_and_mended_before_they_are_computed() {
     let engine = Fake::quick();
     let server = Running::plain(engine.clone());
-    let mut parts = folder("my <i>bowl</i>/");
-    parts.iter_mut().for_each(|p| p.file = p.file.take().map(|f| f.replace(['<', '>', '/'], "").replace("bowltrain", "bowl/train/").replace("bowltransforms", "bowl/transforms")));
-    parts.push(Part::file("my ibowli/readme.md", "of no use"));
+    let mut parts = folder("my & bowl/");
+    parts.push(Part::file("my & bowl/readme.md", "of no use"));
     parts.insert(0, Part::field("scene", r#"{"masks": "alpha", "up": "z"}"#));
     let created = server.post_form(&parts);
     assert_eq!(created.status, 201, "{}", created.text());
     let id = created.json()["id"].as_str().unwrap().to_owned();
     let job = server.until(&id, &["ready", "failed"]);
     assert_eq!(job["state"], "ready", "{job}");
-    assert_eq!(job["passed_over"][0], "my ibowli/readme.md");
+    assert_eq!(job["passed_over"][0], "my & bowl/readme.md");
+    assert_eq!(job["title"], "my & bowl");
     let view = &job["understood"]["views"][1];
     assert!(view["covers"].as_f64().unwrap() > 0.05 && view["camera"]["fx"].as_f64().unwrap() > 100.0);
 
@@ -110,7 +113,7 @@ fn photos_are_looked_at_and_mended_before_they_are_computed() {
     }
     assert_eq!(server.json(&format!("/jobs/{id}"))["understood"]["views"][1]["mended"], true);
     for (what, k, bytes) in [
-        ("none of the object", "1", png(&RgbaImage::from_pixel(512, 512, Rgba([0, 0, 0, 255])))),
+        ("expected some of the object, found none", "1", png(&RgbaImage::from_pixel(512, 512, Rgba([0, 0, 0, 255])))),
         ("512 x 512 pixels, found 511 x 512", "1", png(&RgbaImage::new(511, 512))),
         ("found", "1", b"no picture".to_vec()),
         ("60000", "1", bomb(60000, 60000)),

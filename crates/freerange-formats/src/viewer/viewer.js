@@ -80,7 +80,11 @@ const unit = (a) => a.map((x) => x / Math.hypot(...a));
 class Viewer {
   // `up` is the direction that stays up; colours are an array of three in 0..1.
   constructor(canvas, { up = [0, 0, 1], background = [1, 1, 1] } = {}) {
-    Object.assign(this, { canvas, background, frames: 0, rows: new Float32Array(0) });
+    this.canvas = canvas;
+    this.background = background;
+    this.frames = this.count = 0;
+    this.rows = this.depth = new Float32Array(0);
+    this.sorted = [new Uint32Array(0), new Uint32Array(0)];
     this.up = unit(up);
     // Azimuth 0 looks along the first axis that is not up.
     const side = Math.abs(this.up[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0];
@@ -149,7 +153,10 @@ class Viewer {
         r[11], r[12], r[13],
       ], i * 16);
     }
-    Object.assign(this, { rows, count: n, depth: new Float32Array(n), sorted: [new Uint32Array(n), new Uint32Array(n)] });
+    this.rows = rows;
+    this.count = n;
+    this.depth = new Float32Array(n);
+    this.sorted = [new Uint32Array(n), new Uint32Array(n)];
     gl.bindTexture(gl.TEXTURE_2D, this.texture);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, TEXTURE_ROW * 4, height, 0, gl.RGBA, gl.FLOAT, texels);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
@@ -260,7 +267,7 @@ class Viewer {
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(this.instances);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count ?? 0);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
     gl.disable(gl.BLEND);
     if (this.half) {
       gl.bindFramebuffer(gl.FRAMEBUFFER, null);
@@ -289,7 +296,7 @@ class Viewer {
 
   // From far to near; of equals the last first. Bits of positive floats are ordered as they are: three passes of 11 bits.
   sort(forward, eye) {
-    const n = this.count ?? 0;
+    const n = this.count;
     if (n === 0) return;
     const bits = new Uint32Array(this.depth.buffer), offset = dot(forward, eye);
     for (let i = 0; i < n; i++) {
@@ -399,12 +406,12 @@ function start(data) {
     const bytes = Uint8Array.from(atob(data.textContent.trim()), (c) => c.charCodeAt(0));
     const back = () => getComputedStyle(root).getPropertyValue("--back").trim().match(/[0-9a-f]{2}/gi).map((h) => parseInt(h, 16) / 255);
     const viewer = new Viewer(document.getElementById("view"), { up: data.dataset.up.split(" ").map(Number), background: back() });
-    window.viewer = viewer;
+    Object.assign(window, { viewer });
     const repaint = () => { viewer.background = back(); viewer.redraw(); };
     const dark = window.matchMedia("(prefers-color-scheme: dark)");
     dark.addEventListener("change", repaint);
     document.getElementById("tools").addEventListener("click", (e) => {
-      const name = e.target.dataset.do;
+      const name = e.target instanceof HTMLElement ? e.target.dataset.do : undefined;
       if (name === "background") {
         root.dataset.theme = (root.dataset.theme ?? (dark.matches ? "dark" : "light")) === "dark" ? "light" : "dark";
         repaint();

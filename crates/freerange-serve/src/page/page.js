@@ -4,7 +4,7 @@
  * @typedef {{width: number, height: number, fx: number, fy: number, cx: number, cy: number, world_to_camera: number[]}} Camera
  * @typedef {{name: string, camera: Camera, shown: boolean, covers: number, agreement: number, cut_off: boolean, mended: boolean}} Photo
  * @typedef {{center: number[], radius: number, up: number[], views: Photo[], notes: string[], warnings: string[], format: string, masks: string}} Understood
- * @typedef {{number: number, parts: {sample: number, gaussians: number}[]}} Estimate
+ * @typedef {{number: number, stage: string, parts: {sample: number, gaussians: number}[]}} Estimate
  * @typedef {{id: string, title: string, created: number, state: string, error: ?string, position: ?number, stage: ?string, sample: number, done: number,
  *   total: number, loss: ?number, estimate: ?Estimate, version: number}} Status
  * @typedef {Status & {understood: ?Understood, options: {samples: ?number, seed: ?number}, passed_over: string[], notes: string[],
@@ -84,7 +84,7 @@
   /** @type {?EventSource} */
   let source = null;
   /** @type {Pane[]} */
-  let panes = [];
+  const panes = [];
   /** @type {?number} */
   let looking = null; // the photo whose camera is looked through
   let drawn = 0; // number of the last estimate that was drawn
@@ -260,7 +260,7 @@
     fetching = true;
     try {
       while (job?.state === "running" && job.estimate && job.estimate.number > drawn) {
-        const { id, estimate, stage } = job;
+        const { id, estimate } = job, { stage } = estimate;
         for (const part of estimate.parts) {
           const gaussians = await rows(`/jobs/${id}/estimates/${estimate.number}/${part.sample}`);
           if (!gaussians || job?.id !== id) break;
