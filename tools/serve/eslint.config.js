@@ -8,7 +8,7 @@ export default [
     files: ["**/*.js"],
     languageOptions: {
       sourceType: "script",
-      globals: names("window document location fetch EventSource FormData File FileSystemFileEntry FileSystemDirectoryEntry OffscreenCanvas HTMLElement "
+      globals: names("window document location fetch EventSource FormData File OffscreenCanvas HTMLElement "
         + "HTMLButtonElement HTMLInputElement HTMLSelectElement HTMLProgressElement HTMLCanvasElement HTMLFormElement HTMLAnchorElement HTMLDialogElement "
         + "createImageBitmap setTimeout clearTimeout requestAnimationFrame cancelAnimationFrame ResizeObserver getComputedStyle URLSearchParams atob Viewer"),
     },

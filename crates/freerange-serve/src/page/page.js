@@ -560,12 +560,14 @@
    * @returns {Promise<Picked[]>}
    */
   const walk = async (entry) => {
-    if (entry instanceof FileSystemFileEntry) {
-      const file = await new Promise((/** @type {(f: File) => void} */ done, fail) => entry.file(done, fail));
+    // Not every browser names the kinds of entries.
+    if (entry.isFile) {
+      const one = /** @type {FileSystemFileEntry} */ (entry);
+      const file = await new Promise((/** @type {(f: File) => void} */ done, fail) => one.file(done, fail));
       return [{ path: entry.fullPath.replace(/^\//, ""), file }];
     }
-    if (!(entry instanceof FileSystemDirectoryEntry)) return [];
-    const reader = entry.createReader();
+    if (!entry.isDirectory) return [];
+    const reader = /** @type {FileSystemDirectoryEntry} */ (entry).createReader();
     /** @type {Picked[]} */
     const found = [];
     for (;;) {
