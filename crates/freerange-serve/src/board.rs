@@ -197,7 +197,11 @@ impl Board {
             };
             clear(&uploads(&folder));
             if matches!(record.state, State::Uploading | State::Reading | State::Running) {
-                let again = if scene::is_whole(&folder) { "press go to compute it again" } else { "its photos have to be given again" };
+                let again = if scene::is_whole(&folder) {
+                    "press go to compute it again"
+                } else {
+                    "its photos have to be given again"
+                };
                 record.error = Some(format!("the server ended while this job was {}: {again}", record.state.name()));
                 record.state = State::Interrupted;
                 record.write(&folder)?;
@@ -228,13 +232,18 @@ impl Board {
             // One that nobody came back to makes way.
             let idle = |j: &&Job| j.record.state == State::Ready && j.touched.elapsed() > self.limits.idle_time;
             let oldest = table.jobs.values().filter(idle).min_by_key(|j| j.touched).map(|j| j.record.id.clone());
-            let full = || Refusal::new(429, format!("{} jobs are open, which is all there is room for", self.limits.open_jobs));
+            let full = || {
+                Refusal::new(429, format!("{} jobs are open, which is all there is room for", self.limits.open_jobs))
+            };
             table.forget(&oldest.ok_or_else(full)?);
         }
         let finished = |j: &&Job| !j.record.state.is_open();
         while table.jobs.values().filter(finished).count() >= self.limits.finished_jobs {
             if self.keeps {
-                let text = format!("{} finished jobs are kept, which is all there is room for: remove some", self.limits.finished_jobs);
+                let text = format!(
+                    "{} finished jobs are kept, which is all there is room for: remove some",
+                    self.limits.finished_jobs
+                );
                 return Err(Refusal::new(507, text));
             }
             let oldest = table.jobs.values().filter(finished).min_by_key(|j| j.touched).map(|j| j.record.id.clone());
@@ -315,7 +324,16 @@ impl Board {
     /// Number of jobs by state.
     pub fn counts(&self) -> BTreeMap<&'static str, usize> {
         let mut counts = BTreeMap::new();
-        for state in [State::Reading, State::Ready, State::Queued, State::Running, State::Done, State::Failed, State::Cancelled, State::Interrupted] {
+        for state in [
+            State::Reading,
+            State::Ready,
+            State::Queued,
+            State::Running,
+            State::Done,
+            State::Failed,
+            State::Cancelled,
+            State::Interrupted,
+        ] {
             counts.insert(state.name(), 0);
         }
         self.table().jobs.values().for_each(|j| *counts.entry(j.record.state.name()).or_default() += 1);
@@ -406,7 +424,10 @@ impl Board {
             let table = self.table();
             let job = table.jobs.get(id).ok_or_else(no_such)?;
             if !job.record.state.may_go() || !scene::is_whole(&job.folder) {
-                return Err(Refusal::new(409, format!("this job is {}: its masks cannot be changed now", job.record.state.name())));
+                return Err(Refusal::new(
+                    409,
+                    format!("this job is {}: its masks cannot be changed now", job.record.state.name()),
+                ));
             }
             if job.record.understood["views"].get(k).is_none() {
                 return Err(Refusal::new(404, "there is no such photo"));
@@ -433,7 +454,8 @@ impl Board {
         let job = table.jobs.get(id).ok_or_else(no_such)?;
         let estimate = job.estimates.iter().find(|e| e.number == number);
         let gone = if number <= job.published { 410 } else { 404 };
-        let estimate = estimate.ok_or_else(|| Refusal::new(gone, "this estimate is not there: there are later ones"))?;
+        let estimate =
+            estimate.ok_or_else(|| Refusal::new(gone, "this estimate is not there: there are later ones"))?;
         let part = estimate.parts.iter().find(|(s, _)| *s == sample);
         part.map(|(_, rows)| rows.clone()).ok_or_else(|| Refusal::new(404, "this estimate has no such sample"))
     }
@@ -509,7 +531,11 @@ impl Board {
     /// Reads photos, one job after the other, until the server ends.
     pub fn read_all(&self) {
         while let Some(id) = self.next(State::Reading) {
-            let Ok((folder, options, cancel)) = self.with(&id, |j| (j.folder.clone(), j.record.scene.clone(), j.cancel.clone())) else { continue };
+            let Ok((folder, options, cancel)) =
+                self.with(&id, |j| (j.folder.clone(), j.record.scene.clone(), j.cancel.clone()))
+            else {
+                continue;
+            };
             let upload = uploads(&folder).join("0/0/0");
             let work = || {
                 let understood = scene::prepare(&upload, &folder, &options, &self.limits, &*self.engine)?;
@@ -575,11 +601,16 @@ impl Board {
                 let r = &mut job.record;
                 match outcome {
                     Ok(outcome) => {
-                        r.samples = outcome.samples.iter().map(|(seed, c)| SampleRecord { seed: *seed, gaussians: c.len() }).collect();
+                        r.samples = outcome
+                            .samples
+                            .iter()
+                            .map(|(seed, c)| SampleRecord { seed: *seed, gaussians: c.len() })
+                            .collect();
                         (r.up, r.notes, r.seconds, r.state) = (outcome.up, outcome.notes, outcome.seconds, State::Done);
                     }
                     Err(_) if stopping => {
-                        r.error = Some("the server ended while this job was running: press go to compute it again".into());
+                        r.error =
+                            Some("the server ended while this job was running: press go to compute it again".into());
                         r.state = State::Interrupted;
                     }
                     Err(e) => (r.error, r.state) = (Some(e.text), State::Failed),
@@ -617,7 +648,8 @@ impl Board {
                 return ControlFlow::Break(());
             }
             // Steps of sampling are few, and each is worth a look.
-            let due = step.stage == "sample" || last.is_none_or(|at| at.elapsed() >= BETWEEN) || step.done == step.total;
+            let due =
+                step.stage == "sample" || last.is_none_or(|at| at.elapsed() >= BETWEEN) || step.done == step.total;
             let parts = match due.then(|| (step.estimate)()) {
                 Some(Ok(parts)) => parts,
                 Some(Err(e)) => {
@@ -638,7 +670,10 @@ impl Board {
             (Ok(outcome), _) => outcome,
             (Err(EngineError::Cancelled), _) if late => {
                 let most = self.limits.job_time.as_secs();
-                return Err(Refusal::new(422, format!("this job took longer than {most} seconds, which is all it may")));
+                return Err(Refusal::new(
+                    422,
+                    format!("this job took longer than {most} seconds, which is all it may"),
+                ));
             }
             (Err(EngineError::Cancelled), _) => return Err(Refusal::new(409, "cancelled")),
             (Err(EngineError::Input(e)), _) => return Err(Refusal::new(422, e)),
@@ -744,7 +779,8 @@ impl Job {
         let (r, p) = (&self.record, &self.progress);
         let running = r.state == State::Running;
         let estimate = self.estimates.back().map(|e| {
-            let parts: Vec<_> = e.parts.iter().map(|(s, rows)| json!({ "sample": s, "gaussians": rows.len() / ROW })).collect();
+            let parts: Vec<_> =
+                e.parts.iter().map(|(s, rows)| json!({ "sample": s, "gaussians": rows.len() / ROW })).collect();
             json!({ "number": e.number, "stage": e.stage, "parts": parts })
         });
         json!({

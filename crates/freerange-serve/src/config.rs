@@ -106,17 +106,24 @@ impl ServeConfig {
     pub fn check(&self) -> Result<(), ServeError> {
         let refuse = |option, expected: String, found: String| Err(ServeError::Option { option, expected, found });
         match &self.token {
-            None if !self.host.is_loopback() => {
-                refuse("--token", format!("a secret of {TOKEN} characters or more, to listen at {}", self.host), "none".into())
-            }
-            Some(token) if token.len() < TOKEN || !token.bytes().all(|b| b.is_ascii_alphanumeric() || b"-._~".contains(&b)) => {
+            None if !self.host.is_loopback() => refuse(
+                "--token",
+                format!("a secret of {TOKEN} characters or more, to listen at {}", self.host),
+                "none".into(),
+            ),
+            Some(token)
+                if token.len() < TOKEN || !token.bytes().all(|b| b.is_ascii_alphanumeric() || b"-._~".contains(&b)) =>
+            {
                 // Secrets do not belong into messages.
                 let found = format!("{} characters", token.chars().count());
                 refuse("--token", format!("{TOKEN} letters, digits or - . _ ~, or more"), found)
             }
             _ => Ok(()),
         }?;
-        let odd = self.names.iter().find(|n| n.is_empty() || !n.bytes().all(|b| b.is_ascii_alphanumeric() || b"-.".contains(&b)));
+        let odd = self
+            .names
+            .iter()
+            .find(|n| n.is_empty() || !n.bytes().all(|b| b.is_ascii_alphanumeric() || b"-.".contains(&b)));
         match odd {
             Some(name) => refuse("--name", "a host's name, without a port".into(), name.clone()),
             None => Ok(()),

@@ -59,7 +59,8 @@ impl Guard {
             }
         }
         // Following a link to the page is fine; anything else across sites is not.
-        let landing = request.method == "GET" && request.path == "/" && request.header("sec-fetch-mode") == Some("navigate");
+        let landing =
+            request.method == "GET" && request.path == "/" && request.header("sec-fetch-mode") == Some("navigate");
         match request.header("sec-fetch-site") {
             None | Some("same-origin" | "none") => Ok(()),
             Some(_) if landing => Ok(()),
@@ -71,9 +72,9 @@ impl Guard {
     pub fn admits(&self, request: &Request) -> bool {
         let Some(token) = &self.token else { return true };
         let bearer = request.header("authorization").and_then(|v| v.strip_prefix("Bearer "));
-        let cookie = request.header("cookie").and_then(|v| {
-            v.split(';').find_map(|pair| pair.trim().strip_prefix(COOKIE)?.strip_prefix('='))
-        });
+        let cookie = request
+            .header("cookie")
+            .and_then(|v| v.split(';').find_map(|pair| pair.trim().strip_prefix(COOKIE)?.strip_prefix('=')));
         [bearer, cookie].into_iter().flatten().any(|told| same(told, token))
     }
 
@@ -97,7 +98,17 @@ mod tests {
         for fine in ["localhost:8000", "LOCALHOST", "127.0.0.1:1", "[::1]:80", "studio.example:443"] {
             assert!(loopback.knows(fine), "{fine}");
         }
-        for odd in ["", "evil.example", "localhost.evil.example", "192.168.0.7", "localhost:80:80", "localhost:x", "[::1", "127.0.0.1.nip.example", ":80"] {
+        for odd in [
+            "",
+            "evil.example",
+            "localhost.evil.example",
+            "192.168.0.7",
+            "localhost:80:80",
+            "localhost:x",
+            "[::1",
+            "127.0.0.1.nip.example",
+            ":80",
+        ] {
             assert!(!loopback.knows(odd), "{odd}");
         }
         assert!(at("0.0.0.0", &[]).knows("192.168.0.7:80") && !at("0.0.0.0", &[]).knows("evil.example"));

@@ -116,7 +116,8 @@ impl Request {
         let mut headers: Vec<(String, String)> = Vec::new();
         for header in parsed.headers.iter() {
             let name = header.name.to_ascii_lowercase();
-            let value = std::str::from_utf8(header.value).map_err(|_| malformed(&format!("header {name} is not text")))?;
+            let value =
+                std::str::from_utf8(header.value).map_err(|_| malformed(&format!("header {name} is not text")))?;
             let single = ["host", "content-length", "origin", "authorization", "content-type", "cookie"];
             if single.contains(&name.as_str()) && headers.iter().any(|(k, _)| *k == name) {
                 return Err(malformed(&format!("header {name} comes twice")));
@@ -269,7 +270,8 @@ impl Response {
             head += &format!("Content-Length: {length}\r\n");
         }
         head += "Connection: close\r\n";
-        for (name, value) in COMMON.iter().map(|(n, v)| (*n, *v)).chain(self.headers.iter().map(|(n, v)| (*n, &v[..]))) {
+        for (name, value) in COMMON.iter().map(|(n, v)| (*n, *v)).chain(self.headers.iter().map(|(n, v)| (*n, &v[..])))
+        {
             debug_assert!(!value.contains(['\r', '\n']));
             head += &format!("{name}: {value}\r\n");
         }

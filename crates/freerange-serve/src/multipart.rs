@@ -58,7 +58,13 @@ fn find(haystack: &[u8], needle: &[u8]) -> Option<usize> {
 impl<R: FnMut(&mut [u8]) -> Result<usize, Refusal>> Multipart<R> {
     pub fn new(input: R, boundary: &str) -> Self {
         // The first delimiter has no line before it.
-        Self { input, buffer: b"\r\n".into(), delimiter: format!("\r\n--{boundary}").into(), ended: false, in_part: false }
+        Self {
+            input,
+            buffer: b"\r\n".into(),
+            delimiter: format!("\r\n--{boundary}").into(),
+            ended: false,
+            in_part: false,
+        }
     }
 
     /// Gets more bytes; false at the end.
@@ -191,7 +197,9 @@ mod tests {
         }
     }
 
-    fn all(form: &mut Multipart<impl FnMut(&mut [u8]) -> Result<usize, Refusal>>) -> Result<Vec<(Part, Vec<u8>)>, Refusal> {
+    fn all(
+        form: &mut Multipart<impl FnMut(&mut [u8]) -> Result<usize, Refusal>>,
+    ) -> Result<Vec<(Part, Vec<u8>)>, Refusal> {
         let mut found = Vec::new();
         while let Some(part) = form.next()? {
             let mut bytes = Vec::new();

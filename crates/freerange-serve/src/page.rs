@@ -22,7 +22,18 @@ mod tests {
         let size: usize = FILES.iter().map(|(_, _, text)| text.len()).sum();
         assert!(size < 100_000, "{size} bytes");
         for (name, _, text) in FILES {
-            for odd in ["https://", "http://", "//cdn", "innerHTML", "outerHTML", "insertAdjacentHTML", "document.write", "eval(", "style=\"", " onclick"] {
+            for odd in [
+                "https://",
+                "http://",
+                "//cdn",
+                "innerHTML",
+                "outerHTML",
+                "insertAdjacentHTML",
+                "document.write",
+                "eval(",
+                "style=\"",
+                " onclick",
+            ] {
                 assert!(!text.contains(odd), "{name}: {odd}");
             }
         }

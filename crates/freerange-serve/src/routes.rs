@@ -205,7 +205,9 @@ fn post(site: &Site, request: &mut Request) -> Answer {
             return Err(Refusal::new(422, "expected at most 8 fields beside the files"));
         }
         let text = form.text(TEXT as usize)?;
-        let refused = |e: serde_json::Error| Refusal::new(422, format!("field `{}`: {e}", part.name.chars().take(40).collect::<String>()));
+        let refused = |e: serde_json::Error| {
+            Refusal::new(422, format!("field `{}`: {e}", part.name.chars().take(40).collect::<String>()))
+        };
         match part.name.as_str() {
             "scene" => scene = serde_json::from_str(&text).map_err(refused)?,
             "go" => options = Some(serde_json::from_str(&text).map_err(refused)?),
@@ -218,9 +220,13 @@ fn post(site: &Site, request: &mut Request) -> Answer {
         options.check().map_err(|e| Refusal::new(422, e))?;
     }
     match (example, &site.example) {
-        (None, _) if upload.title.is_none() => return Err(Refusal::new(422, "expected files of photos and cameras, found none")),
+        (None, _) if upload.title.is_none() => {
+            return Err(Refusal::new(422, "expected files of photos and cameras, found none"));
+        }
         (None, _) => {}
-        (Some(_), _) if upload.title.is_some() => return Err(Refusal::new(422, "expected files or the example, found both")),
+        (Some(_), _) if upload.title.is_some() => {
+            return Err(Refusal::new(422, "expected files or the example, found both"));
+        }
         (Some(name), Some(example)) if name == example.name => {
             for (name, bytes) in example.files {
                 let mut left = *bytes;

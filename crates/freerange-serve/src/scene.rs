@@ -133,7 +133,10 @@ pub fn prepare(
     let refused = |e: SceneError| sentence(upload, &e);
     let root = root(upload).map_err(Refusal::own)?;
     let found: Cameras = cameras(&root, None, options.turntable()?.as_ref()).map_err(refused)?;
-    all_inside(upload, found.photos.iter().flat_map(|p| [Some(&p.image), p.mask.as_ref()]).flatten().chain(&found.files))?;
+    all_inside(
+        upload,
+        found.photos.iter().flat_map(|p| [Some(&p.image), p.mask.as_ref()]).flatten().chain(&found.files),
+    )?;
     let config = LoadConfig {
         masks: options.masks()?,
         invert_masks: options.invert_masks,
@@ -167,7 +170,8 @@ pub fn prepare(
     write_atomically(&scene_file(folder), |w| std::io::Write::write_all(w, &text)).map_err(Refusal::own)?;
 
     let mut understood = serde_json::to_value(&report).map_err(Refusal::own)?;
-    understood["canonical_from_user"] = serde_json::to_value::<Similarity>(canonical.canonical_from_user).map_err(Refusal::own)?;
+    understood["canonical_from_user"] =
+        serde_json::to_value::<Similarity>(canonical.canonical_from_user).map_err(Refusal::own)?;
     for (view, told) in loaded.views.iter().zip(understood["views"].as_array_mut().into_iter().flatten()) {
         let c = &view.camera;
         told["camera"] = serde_json::json!({
@@ -186,7 +190,10 @@ fn root(upload: &Path) -> std::io::Result<PathBuf> {
         let inside: Vec<_> = fs::read_dir(&at)?.collect::<Result<_, _>>()?;
         match inside.as_slice() {
             // Names that formats know are part of a scene.
-            [one] if one.file_type()?.is_dir() && !["images", "sparse", "keyframes"].iter().any(|n| one.file_name() == *n) => {
+            [one]
+                if one.file_type()?.is_dir()
+                    && !["images", "sparse", "keyframes"].iter().any(|n| one.file_name() == *n) =>
+            {
                 at = one.path();
             }
             _ => return Ok(at),
@@ -206,10 +213,12 @@ fn picture(path: &Path) -> Result<RgbaImage, Refusal> {
 /// What [`prepare`] wrote, to the bit.
 pub fn open(folder: &Path) -> Result<Scene, Refusal> {
     let kept = kept(folder)?;
-    let view = |(k, v): (usize, KeptView)| {
-        Ok(View { name: v.name, camera: v.camera, image: picture(&view_file(folder, k))? })
-    };
-    Ok(Scene { views: kept.views.into_iter().enumerate().map(view).collect::<Result<_, Refusal>>()?, frame: kept.frame })
+    let view =
+        |(k, v): (usize, KeptView)| Ok(View { name: v.name, camera: v.camera, image: picture(&view_file(folder, k))? });
+    Ok(Scene {
+        views: kept.views.into_iter().enumerate().map(view).collect::<Result<_, Refusal>>()?,
+        frame: kept.frame,
+    })
 }
 
 /// Gives photo number `k` the mask that a client painted: a PNG of the photo's size, whose brightness is the object's share. Returns the share
@@ -241,7 +250,9 @@ pub fn mend(folder: &Path, k: usize, png: &[u8]) -> Result<f64, Refusal> {
 }
 
 fn mask(png: &[u8], size: (u32, u32)) -> Result<GrayImage, Refusal> {
-    let refuse = |found: String| Refusal::new(422, format!("mask: expected a PNG of {} x {} pixels, found {found}", size.0, size.1));
+    let refuse = |found: String| {
+        Refusal::new(422, format!("mask: expected a PNG of {} x {} pixels, found {found}", size.0, size.1))
+    };
     let reader = || ImageReader::with_format(std::io::Cursor::new(png), ImageFormat::Png);
     let mut head = reader();
     let mut limits = image::Limits::default();

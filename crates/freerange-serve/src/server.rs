@@ -110,7 +110,8 @@ impl Server {
         let board = &self.site.board;
         let (reads, computes) = (board.clone(), board.clone());
         let named = |name: &str| thread::Builder::new().name(name.into());
-        let workers = [named("photos").spawn(move || reads.read_all())?, named("jobs").spawn(move || computes.compute_all())?];
+        let workers =
+            [named("photos").spawn(move || reads.read_all())?, named("jobs").spawn(move || computes.compute_all())?];
         let limits = board.limits();
         let patience = Patience { head: limits.head_time, whole: limits.request_time };
         for stream in self.listener.incoming() {

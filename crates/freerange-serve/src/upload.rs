@@ -89,7 +89,11 @@ impl<'a> Upload<'a> {
     }
 
     /// Takes the file that the client calls `name`; `read` gives its bytes, and none at the end.
-    pub fn file(&mut self, name: &str, mut read: impl FnMut(&mut [u8]) -> Result<usize, Refusal>) -> Result<(), Refusal> {
+    pub fn file(
+        &mut self,
+        name: &str,
+        mut read: impl FnMut(&mut [u8]) -> Result<usize, Refusal>,
+    ) -> Result<(), Refusal> {
         self.files += 1;
         if self.files > self.limits.files {
             return Err(Refusal::new(413, format!("expected at most {} files", self.limits.files)));
@@ -137,7 +141,8 @@ impl<'a> Upload<'a> {
 
     /// Looks at a picture's head: its kind and size have to be usual before anything is decoded.
     fn picture(&mut self, path: &Path, name: &str) -> Result<(), Refusal> {
-        let (width, height) = picture_size(path).map_err(|what| Refusal::new(422, format!("picture `{}`: {what}", shown(name))))?;
+        let (width, height) =
+            picture_size(path).map_err(|what| Refusal::new(422, format!("picture `{}`: {what}", shown(name))))?;
         let pixels = u64::from(width) * u64::from(height);
         self.pixels += pixels;
         let (one, all) = (self.limits.pixels, self.limits.job_pixels);
@@ -188,7 +193,9 @@ fn leaves(value: &Value) -> Option<&str> {
     match value {
         Value::Array(values) => values.iter().find_map(leaves),
         Value::Object(fields) => fields.iter().find_map(|(key, value)| match value {
-            Value::String(text) if key.ends_with("path") || key.ends_with("file") || key == "image" || key == "mask" => {
+            Value::String(text)
+                if key.ends_with("path") || key.ends_with("file") || key == "image" || key == "mask" =>
+            {
                 let absolute = text.starts_with(['/', '\\', '~']) || text.chars().nth(1) == Some(':');
                 let up = text.split(['/', '\\']).any(|part| part == "..");
                 (absolute || up || text.contains('\0')).then_some(text.as_str())
@@ -222,8 +229,24 @@ mod tests {
         assert_eq!(parts("Schüssel ä.png").unwrap(), ["Schüssel ä.png"]);
         let long = "a".repeat(121);
         for odd in [
-            "", "..", "../x.png", "a/../x.png", "a\\..\\x.png", "/etc/passwd", "\\\\host\\x", "C:\\x.png", "C:/x.png", "a//b.png", "a/", "x\0.png",
-            "a\nb.png", "x.png.", "x ", "<b>.png", "a/b/c/d/e/f/g.png", &long,
+            "",
+            "..",
+            "../x.png",
+            "a/../x.png",
+            "a\\..\\x.png",
+            "/etc/passwd",
+            "\\\\host\\x",
+            "C:\\x.png",
+            "C:/x.png",
+            "a//b.png",
+            "a/",
+            "x\0.png",
+            "a\nb.png",
+            "x.png.",
+            "x ",
+            "<b>.png",
+            "a/b/c/d/e/f/g.png",
+            &long,
         ] {
             assert!(parts(odd).is_err(), "{odd:?}");
         }

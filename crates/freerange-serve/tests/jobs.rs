@@ -2,7 +2,15 @@
 
 mod common;
 
-use std::{collections::BTreeSet, fs, io::Read, net::TcpStream, sync::Arc, thread, time::{Duration, Instant}};
+use std::{
+    collections::BTreeSet,
+    fs,
+    io::Read,
+    net::TcpStream,
+    sync::Arc,
+    thread,
+    time::{Duration, Instant},
+};
 
 use common::*;
 use freerange_formats::{Format, Frame, parse};
@@ -16,7 +24,11 @@ fn the_example_becomes_gaussians_while_one_watches() {
     let id = server.example(r#"{"samples": 2, "seed": 3}"#);
     // What the stream of events tells, and the Gaussians that it points at.
     let mut stream = TcpStream::connect(server.address).unwrap();
-    std::io::Write::write_all(&mut stream, format!("GET /jobs/{id}/events HTTP/1.1\r\nHost: localhost\r\n\r\n").as_bytes()).unwrap();
+    std::io::Write::write_all(
+        &mut stream,
+        format!("GET /jobs/{id}/events HTTP/1.1\r\nHost: localhost\r\n\r\n").as_bytes(),
+    )
+    .unwrap();
     let (mut text, mut at, mut states, mut clouds) = (String::new(), 0, Vec::new(), BTreeSet::new());
     let mut chunk = [0; 4096];
     while states.last().is_none_or(|s| s != "done") {
@@ -70,7 +82,16 @@ fn the_example_becomes_gaussians_while_one_watches() {
         assert_eq!((picture.dimensions(), reply.headers["content-type"].as_str()), (size, "image/png"), "{path}");
     }
     assert!(image::load_from_memory(&server.get(&format!("/jobs/{id}/sheet.png")).body).unwrap().width() > 500);
-    for missing in ["samples/2", "samples/0.exe", "samples/-1", "photos/4.png", "photos/0", "views/../job.json", "nothing", "estimates/9/9"] {
+    for missing in [
+        "samples/2",
+        "samples/0.exe",
+        "samples/-1",
+        "photos/4.png",
+        "photos/0",
+        "views/../job.json",
+        "nothing",
+        "estimates/9/9",
+    ] {
         assert!([404, 410].contains(&server.get(&format!("/jobs/{id}/{missing}")).status), "{missing}");
     }
     assert_eq!(server.json("/jobs")[0]["id"], id.as_str());
@@ -99,7 +120,13 @@ fn photos_are_looked_at_and_mended_before_they_are_computed() {
     // A half of the second photo's object is painted away, and a patch is added.
     let before = image::load_from_memory(&server.get(&format!("/jobs/{id}/views/1.png")).body).unwrap().into_rgba8();
     let mask = RgbaImage::from_fn(512, 512, |x, y| {
-        let v = if x < 256 { before.get_pixel(x, y)[3] } else if y < 10 { 255 } else { 0 };
+        let v = if x < 256 {
+            before.get_pixel(x, y)[3]
+        } else if y < 10 {
+            255
+        } else {
+            0
+        };
         Rgba([v, v, v, 255])
     });
     let put = |k: &str, bytes: &[u8]| server.send("PUT", &format!("/jobs/{id}/masks/{k}"), "", bytes);
@@ -128,7 +155,10 @@ fn photos_are_looked_at_and_mended_before_they_are_computed() {
     let (names, covered, _) = engine.seen.lock().unwrap()[0].clone();
     assert_eq!(names, ["000", "001", "002", "003"]);
     assert_eq!(covered[1], wanted, "the mended mask is what is computed with");
-    assert_eq!(covered[0], image::open(bowl().join("train/000.png")).unwrap().into_rgba8().pixels().filter(|p| p[3] >= 128).count());
+    assert_eq!(
+        covered[0],
+        image::open(bowl().join("train/000.png")).unwrap().into_rgba8().pixels().filter(|p| p[3] >= 128).count()
+    );
 }
 
 #[test]
@@ -193,7 +223,11 @@ fn snapshot(from: &std::path::Path, to: &std::path::Path) {
 #[test]
 fn a_restart_finds_finished_jobs_and_says_of_others_that_they_did_not_survive() {
     let (keep, copy) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
-    let config = |folder: &std::path::Path| ServeConfig { keep: Some(folder.into()), example: Some(EXAMPLE), ..ServeConfig::default() };
+    let config = |folder: &std::path::Path| ServeConfig {
+        keep: Some(folder.into()),
+        example: Some(EXAMPLE),
+        ..ServeConfig::default()
+    };
     let quick = Running::start(config(keep.path()), Fake::quick());
     let done = quick.example(r#"{"seed": 5}"#);
     quick.until(&done, &["done"]);
@@ -217,7 +251,10 @@ fn a_restart_finds_finished_jobs_and_says_of_others_that_they_did_not_survive() 
     let after = Running::start(config(copy.path()), engine.clone());
     assert_eq!(after.json(&format!("/jobs/{done}"))["samples"][0]["seed"], 5);
     let job = after.json(&format!("/jobs/{running}"));
-    assert!(job["state"] == "interrupted" && job["error"].as_str().unwrap().contains("while this job was running"), "{job}");
+    assert!(
+        job["state"] == "interrupted" && job["error"].as_str().unwrap().contains("while this job was running"),
+        "{job}"
+    );
     after.until(&queued, &["done"]);
     assert!(!arriving.exists() && copy.path().join("fedcba9876543210").is_dir());
     // Its photos are there still: it can be computed again.
@@ -240,7 +277,8 @@ fn without_a_folder_nothing_stays() {
     server.until(&id, &["done"]);
     let mine = || {
         let all = fs::read_dir(std::env::temp_dir()).unwrap().map(Result::unwrap);
-        all.filter(|e| e.file_name().to_string_lossy().starts_with("freerange-serve-") && e.path().join(&id).is_dir()).count()
+        all.filter(|e| e.file_name().to_string_lossy().starts_with("freerange-serve-") && e.path().join(&id).is_dir())
+            .count()
     };
     assert_eq!(mine(), 1);
     server.stop();

@@ -34,14 +34,20 @@ fn pages_of_other_sites_cannot_ask() {
     assert_eq!(ask("GET", "/jobs", &format!("{own}Host: localhost\r\n")), 400, "two");
     // Another origin, or one that does not say which.
     for origin in ["http://evil.example", "null", "http://127.0.0.1:1", "file://", "http://127.0.0.1.evil.example"] {
-        for (method, path) in [("POST", "/jobs"), ("GET", "/jobs"), ("DELETE", "/jobs/0123456789abcdef"), ("OPTIONS", "/jobs")] {
+        for (method, path) in
+            [("POST", "/jobs"), ("GET", "/jobs"), ("DELETE", "/jobs/0123456789abcdef"), ("OPTIONS", "/jobs")]
+        {
             assert_eq!(ask(method, path, &format!("{own}Origin: {origin}\r\n")), 403, "{origin} {method}");
         }
     }
     assert_eq!(ask("GET", "/jobs", &format!("{own}Origin: http://{}\r\n", server.address)), 200);
     assert_eq!(ask("GET", "/jobs", &format!("{own}Sec-Fetch-Site: cross-site\r\n")), 403);
     assert_eq!(ask("GET", "/jobs", &format!("{own}Sec-Fetch-Site: cross-site\r\nSec-Fetch-Mode: navigate\r\n")), 403);
-    assert_eq!(ask("GET", "/", &format!("{own}Sec-Fetch-Site: cross-site\r\nSec-Fetch-Mode: navigate\r\n")), 200, "a link to the page");
+    assert_eq!(
+        ask("GET", "/", &format!("{own}Sec-Fetch-Site: cross-site\r\nSec-Fetch-Mode: navigate\r\n")),
+        200,
+        "a link to the page"
+    );
     assert_eq!(ask("OPTIONS", "/jobs", &own), 405);
     assert_eq!(ask("POST", "/", &own), 405);
     assert_eq!(ask("TRACE", "/jobs", &own), 405);
@@ -52,10 +58,23 @@ fn every_answer_forbids_what_is_from_outside() {
     let server = Running::plain(Fake::quick());
     let id = server.example("{}");
     server.until(&id, &["done"]);
-    for path in ["/", "/page.js", "/viewer.js", "/style.css", "/jobs", "/nothing", "/health", "/metrics", &format!("/jobs/{id}/samples/0.html")] {
+    for path in [
+        "/",
+        "/page.js",
+        "/viewer.js",
+        "/style.css",
+        "/jobs",
+        "/nothing",
+        "/health",
+        "/metrics",
+        &format!("/jobs/{id}/samples/0.html"),
+    ] {
         let reply = server.get(path);
         let policy = &reply.headers["content-security-policy"];
-        assert!(policy.starts_with("default-src 'none'; script-src 'self';") && policy.contains("frame-ancestors 'none'"), "{path}");
+        assert!(
+            policy.starts_with("default-src 'none'; script-src 'self';") && policy.contains("frame-ancestors 'none'"),
+            "{path}"
+        );
         assert!(!policy.contains("unsafe") && !policy.contains("http"), "{path}");
         assert_eq!(reply.headers["x-content-type-options"], "nosniff", "{path}");
         assert!(reply.headers.keys().all(|k| !k.starts_with("access-control")), "{path}: no CORS");
@@ -64,9 +83,16 @@ fn every_answer_forbids_what_is_from_outside() {
     let page = server.get("/");
     assert_eq!(page.headers["content-type"], "text/html; charset=utf-8");
     let head = server.send("HEAD", "/", "", b"");
-    assert!(head.status == 200 && head.body.is_empty() && head.headers["content-length"] == page.body.len().to_string());
+    assert!(
+        head.status == 200 && head.body.is_empty() && head.headers["content-length"] == page.body.len().to_string()
+    );
     let text = server.get("/metrics").text();
-    for line in ["freerange_jobs{state=\"done\"} 1", "freerange_jobs_ended_total{state=\"done\"} 1", "# TYPE freerange_answers_total counter", "freerange_resident_bytes "] {
+    for line in [
+        "freerange_jobs{state=\"done\"} 1",
+        "freerange_jobs_ended_total{state=\"done\"} 1",
+        "# TYPE freerange_answers_total counter",
+        "freerange_resident_bytes ",
+    ] {
         assert!(text.contains(line), "{line} in {text}");
     }
 }
@@ -78,7 +104,10 @@ fn beyond_loopback_a_token_is_needed() {
     assert!(refused(&config).contains("--token"));
     let short = refused(&ServeConfig { token: Some("secret".into()), ..config.clone() });
     assert!(short.contains("--token") && !short.contains("secret"), "{short}");
-    assert!(refused(&ServeConfig { names: vec!["a:80".into()], token: Some(TOKEN.into()), ..config.clone() }).contains("--name"));
+    assert!(
+        refused(&ServeConfig { names: vec!["a:80".into()], token: Some(TOKEN.into()), ..config.clone() })
+            .contains("--name")
+    );
 
     let server = Running::start(ServeConfig { token: Some(TOKEN.into()), ..config }, Fake::quick());
     for path in ["/jobs", "/page.js", "/metrics", "/server", "/jobs/0123456789abcdef/events"] {
@@ -87,7 +116,11 @@ fn beyond_loopback_a_token_is_needed() {
     assert_eq!(server.get("/health").status, 200, "probes know no secret");
     assert_eq!(server.post_form(&folder("")).status, 401);
     let asked = server.get("/?token=wrong-horse-battery-1");
-    assert!(asked.status == 401 && asked.text().contains("<form") && !asked.text().contains("wrong"), "{}", asked.text());
+    assert!(
+        asked.status == 401 && asked.text().contains("<form") && !asked.text().contains("wrong"),
+        "{}",
+        asked.text()
+    );
     let known = |headers: &str| server.send("GET", "/jobs", headers, b"").status;
     assert_eq!(known(&format!("Authorization: Bearer {TOKEN}\r\n")), 200);
     assert_eq!(known(&format!("Authorization: Bearer {TOKEN}x\r\n")), 401);
@@ -108,7 +141,15 @@ fn names_of_clients_are_no_paths_of_ours() {
     let folder_of_jobs = tempfile::tempdir().unwrap();
     let config = ServeConfig { keep: Some(folder_of_jobs.path().join("keep")), ..ServeConfig::default() };
     let server = Running::start(config, Fake::quick());
-    for name in ["../../escaped.png", "/tmp/escaped.png", "a/../../../escaped.png", "..\\..\\escaped.png", "C:\\escaped.png", "a\\..\\..\\escaped.png", "escaped.png\u{0}.jpg"] {
+    for name in [
+        "../../escaped.png",
+        "/tmp/escaped.png",
+        "a/../../../escaped.png",
+        "..\\..\\escaped.png",
+        "C:\\escaped.png",
+        "a\\..\\..\\escaped.png",
+        "escaped.png\u{0}.jpg",
+    ] {
         let reply = server.post_form(&[Part::file(name, EXAMPLE.files[1].1)]);
         assert!([400, 422].contains(&reply.status), "{name:?}: {} {}", reply.status, reply.text());
     }
@@ -130,7 +171,11 @@ fn names_of_clients_are_no_paths_of_ours() {
     // COLMAP's names are followed within the folder only: its reader refuses them, later.
     let cameras = "1 PINHOLE 512 512 500 500 256 256\n";
     let images = format!("1 1 0 0 0 0 0 2 1 {}\n\n2 1 0 0 0 1 0 2 1 ../../../../../secret.png\n\n", secret.display());
-    let parts = [Part::file("s/sparse/0/cameras.txt", cameras), Part::file("s/sparse/0/images.txt", images), Part::file("s/images/x.png", EXAMPLE.files[1].1)];
+    let parts = [
+        Part::file("s/sparse/0/cameras.txt", cameras),
+        Part::file("s/sparse/0/images.txt", images),
+        Part::file("s/images/x.png", EXAMPLE.files[1].1),
+    ];
     let id = server.post_form(&parts).json()["id"].as_str().unwrap().to_owned();
     let job = server.until(&id, &["failed", "ready"]);
     let error = job["error"].as_str().unwrap_or_default();
@@ -165,7 +210,11 @@ fn hostile_pictures_are_refused_before_they_are_decoded() {
     let job = server.until(&id, &["failed", "ready"]);
     assert!(job["state"] == "failed" && job["error"].as_str().unwrap().contains("001.png"), "{job}");
     assert!(!job["error"].as_str().unwrap().contains("/upload"), "where files lie is not told: {job}");
-    for json in ["[".repeat(100_000), "{\"frames\": 3}".into(), "{\"frames\": [{\"file_path\": \"x\", \"transform_matrix\": [[1e999]]}]}".into()] {
+    for json in [
+        "[".repeat(100_000),
+        "{\"frames\": 3}".into(),
+        "{\"frames\": [{\"file_path\": \"x\", \"transform_matrix\": [[1e999]]}]}".into(),
+    ] {
         let mut parts = folder("x/");
         parts[0].bytes = json.into();
         let id = server.post_form(&parts).json()["id"].as_str().unwrap().to_owned();
@@ -175,7 +224,15 @@ fn hostile_pictures_are_refused_before_they_are_decoded() {
 
 #[test]
 fn bytes_pixels_files_and_jobs_have_limits() {
-    let server = with(Limits { bytes: 400_000, file_bytes: 90_000, files: 6, pixels: 300_000, job_pixels: 900_000, open_jobs: 2, ..Limits::default() });
+    let server = with(Limits {
+        bytes: 400_000,
+        file_bytes: 90_000,
+        files: 6,
+        pixels: 300_000,
+        job_pixels: 900_000,
+        open_jobs: 2,
+        ..Limits::default()
+    });
     let post = |parts: &[Part]| {
         let reply = server.post_form(parts);
         (reply.status, reply.error())
@@ -196,14 +253,23 @@ fn bytes_pixels_files_and_jobs_have_limits() {
     assert_eq!(post(&[Part::field("go", r#"{"samples": 9}"#), Part::file("a.txt", "x")]).0, 422);
     assert_eq!(post(&[Part::field("go", r#"{"sampels": 1}"#), Part::file("a.txt", "x")]).0, 422);
     // A length that is told is refused before it comes.
-    let told = format!("POST /jobs HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data; boundary=x\r\nContent-Length: {}\r\n\r\n", 1u64 << 40);
+    let told = format!(
+        "POST /jobs HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data; boundary=x\r\nContent-Length: {}\r\n\r\n",
+        1u64 << 40
+    );
     assert_eq!(server.raw(told.as_bytes()).status, 413);
     assert_eq!(server.send("POST", "/jobs", "Content-Type: application/json\r\n", b"{}").status, 415);
-    assert_eq!(server.send("POST", "/jobs", "Content-Encoding: gzip\r\nContent-Type: multipart/form-data; boundary=x\r\n", b"").status, 415);
+    assert_eq!(
+        server
+            .send("POST", "/jobs", "Content-Encoding: gzip\r\nContent-Type: multipart/form-data; boundary=x\r\n", b"")
+            .status,
+        415
+    );
 
     let server = with(Limits { open_jobs: 2, idle_time: Duration::from_secs(3), ..Limits::default() });
     let example = [Part::field("example", "bowl")];
-    let ids: Vec<String> = (0..2).map(|_| server.post_form(&example).json()["id"].as_str().unwrap().to_owned()).collect();
+    let ids: Vec<String> =
+        (0..2).map(|_| server.post_form(&example).json()["id"].as_str().unwrap().to_owned()).collect();
     ids.iter().for_each(|id| drop(server.until(id, &["ready"])));
     assert_eq!(server.post_form(&example).status, 429);
     std::thread::sleep(Duration::from_millis(3500));
@@ -213,7 +279,10 @@ fn bytes_pixels_files_and_jobs_have_limits() {
 
     let keep = tempfile::tempdir().unwrap();
     let limits = Limits { finished_jobs: 1, ..Limits::default() };
-    let server = Running::start(ServeConfig { keep: Some(keep.path().into()), example: Some(EXAMPLE), limits, ..ServeConfig::default() }, Fake::quick());
+    let server = Running::start(
+        ServeConfig { keep: Some(keep.path().into()), example: Some(EXAMPLE), limits, ..ServeConfig::default() },
+        Fake::quick(),
+    );
     let id = server.example("{}");
     server.until(&id, &["done"]);
     assert_eq!(server.post_form(&example).status, 507, "what is to be kept is not thrown away");
@@ -237,14 +306,34 @@ fn odd_requests_are_refused() {
     assert_eq!(status("GET /jobs/../../etc/passwd HTTP/1.1\r\nHost: localhost\r\n\r\n"), 404);
     assert_eq!(status("GET /%2e%2e/%2e%2e/etc/passwd HTTP/1.1\r\nHost: localhost\r\n\r\n"), 404);
     assert_eq!(status("GET //etc/passwd HTTP/1.1\r\nHost: localhost\r\n\r\n"), 404);
-    assert_eq!(server.send("POST", "/jobs", &format!("Content-Type: multipart/form-data; boundary={BOUNDARY}\r\n"), b"no form").status, 400);
+    assert_eq!(
+        server
+            .send("POST", "/jobs", &format!("Content-Type: multipart/form-data; boundary={BOUNDARY}\r\n"), b"no form")
+            .status,
+        400
+    );
     // A form that ends in the middle leaves nothing.
     let body = form(&folder(""));
-    assert_eq!(server.send("POST", "/jobs", &format!("Content-Type: multipart/form-data; boundary={BOUNDARY}\r\n"), &body[..body.len() / 2]).status, 400);
+    assert_eq!(
+        server
+            .send(
+                "POST",
+                "/jobs",
+                &format!("Content-Type: multipart/form-data; boundary={BOUNDARY}\r\n"),
+                &body[..body.len() / 2]
+            )
+            .status,
+        400
+    );
     assert_eq!(server.json("/jobs"), serde_json::json!([]));
     let mut state = 1u64;
     for _ in 0..200 {
-        let bytes: Vec<u8> = (0..60).map(|_| { state = state.wrapping_mul(6364136223846793005).wrapping_add(1); (state >> 56) as u8 }).collect();
+        let bytes: Vec<u8> = (0..60)
+            .map(|_| {
+                state = state.wrapping_mul(6364136223846793005).wrapping_add(1);
+                (state >> 56) as u8
+            })
+            .collect();
         server.raw(&[&bytes[..], b"\r\n\r\n"].concat());
     }
     assert_eq!(server.get("/health").status, 200);
@@ -252,7 +341,8 @@ fn odd_requests_are_refused() {
 
 #[test]
 fn slow_clients_and_too_many_are_let_go() {
-    let limits = Limits { head_time: Duration::from_millis(300), request_time: Duration::from_millis(600), ..Limits::default() };
+    let limits =
+        Limits { head_time: Duration::from_millis(300), request_time: Duration::from_millis(600), ..Limits::default() };
     let server = with(limits);
     let begin = Instant::now();
     // A head, letter by letter.
@@ -266,7 +356,9 @@ fn slow_clients_and_too_many_are_let_go() {
     assert_eq!(Reply::read(stream).status, 408);
     // A body that never comes.
     let begin = Instant::now();
-    let told = format!("POST /jobs HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data; boundary={BOUNDARY}\r\nContent-Length: 1000\r\n\r\n");
+    let told = format!(
+        "POST /jobs HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data; boundary={BOUNDARY}\r\nContent-Length: 1000\r\n\r\n"
+    );
     assert_eq!(server.raw(told.as_bytes()).status, 408);
     assert!(begin.elapsed() < Duration::from_secs(5));
     // More connections than there are places. (These are given time: a starved machine must not free one.)

@@ -43,10 +43,13 @@ fn hostile(i: usize) -> (&'static str, Vec<Part>) {
 fn two_hundred_jobs_by_twenty_clients() {
     let keep = tempfile::tempdir().unwrap();
     let limits = Limits { file_bytes: 2 << 20, open_jobs: 64, finished_jobs: 1000, side: 128, ..Limits::default() };
-    let config = ServeConfig { keep: Some(keep.path().into()), example: Some(EXAMPLE), limits, ..ServeConfig::default() };
-    let server = Running::start(config, Arc::new(Fake { pause: Duration::from_millis(2), steps: 20, ..Fake::default() }));
+    let config =
+        ServeConfig { keep: Some(keep.path().into()), example: Some(EXAMPLE), limits, ..ServeConfig::default() };
+    let server =
+        Running::start(config, Arc::new(Fake { pause: Duration::from_millis(2), steps: 20, ..Fake::default() }));
     let got: Mutex<BTreeMap<String, BTreeMap<String, usize>>> = Mutex::default();
-    let count = |what: &str, came: String| *got.lock().unwrap().entry(what.into()).or_default().entry(came).or_default() += 1;
+    let count =
+        |what: &str, came: String| *got.lock().unwrap().entry(what.into()).or_default().entry(came).or_default() += 1;
     let client = |c: usize| {
         for j in 0..10 {
             let n = 10 * c + j;
@@ -88,7 +91,15 @@ fn two_hundred_jobs_by_twenty_clients() {
     println!("{got:?}\ndescriptors {} to {}, memory {} to {} MiB", before.0, after.0, before.1 >> 20, after.1 >> 20);
     let sum = |what: &str| got[what].values().sum::<usize>();
     assert_eq!((sum("good"), got["good"]["done"], sum("cancelled")), (67, 67, 67));
-    for (what, came) in [("bomb", "413"), ("path", "422"), ("archive", "415"), ("no picture", "422"), ("cut picture", "failed"), ("nested JSON", "failed"), ("too large", "413")] {
+    for (what, came) in [
+        ("bomb", "413"),
+        ("path", "422"),
+        ("archive", "415"),
+        ("no picture", "422"),
+        ("cut picture", "failed"),
+        ("nested JSON", "failed"),
+        ("too large", "413"),
+    ] {
         assert!(got[what].len() == 1 && got[what].contains_key(came), "{what}: {:?}", got[what]);
     }
     let jobs = server.json("/jobs");

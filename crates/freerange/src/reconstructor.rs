@@ -169,8 +169,7 @@ impl Reconstructor {
                 let seed = member as u64;
                 let Turned { views, back } = &turned[member];
                 let place = Place { back, canonical_from_user: &frame.canonical_from_user };
-                let mut fit =
-                    watched(Stage::Fit, 0, place, &mut tell, done, |p| quick_fit(views, config, seed, p))?;
+                let mut fit = watched(Stage::Fit, 0, place, &mut tell, done, |p| quick_fit(views, config, seed, p))?;
                 // The fit knows better than the masks where the object is; it moves along, so that one is enough.
                 if member == 0 && !frame.kept {
                     let correction = frame_of(&fit, &turned[0].views)?;

@@ -411,7 +411,7 @@
    * @param {Understood} understood
    */
   const photos = (now, understood) => {
-    const key = JSON.stringify([now.id, now.may_go, understood.views.map((v) => v.covers)]), list = box("photos");
+    const key = JSON.stringify([now.id, now.may_go, understood.views.map((v) => [v.covers, v.mended])]), list = box("photos");
     if (list.dataset.key === key) return;
     list.dataset.key = key;
     list.replaceChildren(...understood.views.map((photo, k) => {

@@ -16,9 +16,7 @@ use std::{
 };
 
 use freerange_camera::{Camera, View};
-use freerange_serve::{
-    Engine, EngineError, Example, JobOptions, Outcome, Scene, ServeConfig, Server, Step, Stopper,
-};
+use freerange_serve::{Engine, EngineError, Example, JobOptions, Outcome, Scene, ServeConfig, Server, Step, Stopper};
 use freerange_splat::{Cloud, channel};
 use image::RgbaImage;
 use serde_json::Value;
@@ -63,7 +61,8 @@ impl Fake {
         for i in 0..40 {
             let mut row = [0.0; channel::COUNT];
             let t = i as f32;
-            (row[0], row[1], row[2]) = (0.3 * t.cos(), 0.3 * t.sin(), 0.01 * t + 0.001 * done as f32 + 0.1 * seed as f32);
+            (row[0], row[1], row[2]) =
+                (0.3 * t.cos(), 0.3 * t.sin(), 0.01 * t + 0.001 * done as f32 + 0.1 * seed as f32);
             (row[3], row[4], row[5], row[6], row[10], row[11]) = (-3.0, -3.0, -3.0, 1.0, 2.0, 0.5);
             rows.extend(row);
         }
@@ -231,7 +230,8 @@ impl Reply {
         let head = String::from_utf8(bytes[..end].to_vec()).unwrap();
         let mut lines = head.split("\r\n");
         let status = lines.next().unwrap().split(' ').nth(1).unwrap().parse().unwrap();
-        let headers = lines.map(|l| l.split_once(": ").unwrap()).map(|(k, v)| (k.to_lowercase(), v.to_owned())).collect();
+        let headers =
+            lines.map(|l| l.split_once(": ").unwrap()).map(|(k, v)| (k.to_lowercase(), v.to_owned())).collect();
         Self { status, headers, body: bytes[end + 4..].to_vec() }
     }
 
@@ -271,7 +271,9 @@ pub fn form(parts: &[Part]) -> Vec<u8> {
     let mut body = Vec::new();
     for part in parts {
         let file = part.file.as_ref().map_or(String::new(), |f| format!("; filename=\"{f}\""));
-        body.extend(format!("--{BOUNDARY}\r\nContent-Disposition: form-data; name=\"{}\"{file}\r\n\r\n", part.name).bytes());
+        body.extend(
+            format!("--{BOUNDARY}\r\nContent-Disposition: form-data; name=\"{}\"{file}\r\n\r\n", part.name).bytes(),
+        );
         body.extend(&part.bytes);
         body.extend(b"\r\n");
     }
