@@ -1,12 +1,15 @@
 //! Options that say how photos are read, and the scene that comes of them.
 
-use std::{path::Path, str::FromStr};
+use std::{
+    path::{Path, PathBuf},
+    str::FromStr,
+};
 
 use freerange::{FrameConfig, Up};
 use freerange_scene::{
     LoadConfig, Loaded, MaskSource,
     estimate::{Hints, table_faces},
-    load,
+    files, load,
     read::{Cameras, Format, Turntable, cameras},
 };
 use glam::DVec3;
@@ -116,16 +119,42 @@ pub struct Scene {
 }
 
 impl Photos {
-    /// Reads a scene.
-    pub fn load(&self, scene: &Path, up: UpChoice) -> Result<Scene, CliError> {
-        let cameras = cameras(scene, self.cameras, self.turntable.as_ref())?;
-        let config = LoadConfig {
+    /// Reads the cameras of a scene.
+    pub fn cameras(&self, scene: &Path) -> Result<Cameras, CliError> {
+        Ok(cameras(scene, self.cameras, self.turntable.as_ref())?)
+    }
+
+    fn config(&self) -> LoadConfig {
+        LoadConfig {
             masks: self.masks.clone().unwrap_or_default(),
             invert_masks: self.invert_masks,
             max_side: self.max_side,
             hints: Hints { center: self.center, radius: self.radius },
-        };
-        let loaded = load(&cameras, &config)?;
+        }
+    }
+
+    /// The files that a scene is read from.
+    pub fn files(&self, cameras: &Cameras) -> Result<Vec<PathBuf>, CliError> {
+        Ok(files(cameras, &self.config())?)
+    }
+
+    /// Name and value of every option.
+    pub fn told(&self) -> Vec<(String, String)> {
+        let Self { cameras, turntable, masks, invert_masks, max_side, center, radius } = self;
+        vec![
+            ("cameras".into(), format!("{:?}", cameras.map(Format::name))),
+            ("turntable".into(), format!("{turntable:?}")),
+            ("masks".into(), format!("{masks:?}")),
+            ("invert-masks".into(), invert_masks.to_string()),
+            ("max-side".into(), max_side.to_string()),
+            ("center".into(), format!("{center:?}")),
+            ("radius".into(), format!("{radius:?}")),
+        ]
+    }
+
+    /// Reads a scene.
+    pub fn load(&self, cameras: Cameras, up: UpChoice) -> Result<Scene, CliError> {
+        let loaded = load(&cameras, &self.config())?;
         let mut notes: Vec<String> = cameras.notes.iter().chain(&loaded.notes).cloned().collect();
         let up = match (up, cameras.format) {
             (UpChoice::Told(up), _) => up,

@@ -12,4 +12,4 @@ mod load;
 pub mod read;
 
 pub use error::SceneError;
-pub use load::{LoadConfig, Loaded, MaskKind, MaskSource, load, write_masks};
+pub use load::{LoadConfig, Loaded, MaskKind, MaskSource, files, load, write_masks};

@@ -10,7 +10,7 @@ use freerange_camera::{Camera, Lens, View, image_ops::resize_area, scene::cut_ou
 use image::{DynamicImage, GrayImage, ImageDecoder, ImageReader, Luma, Rgba, RgbaImage, metadata::Orientation};
 use rayon::prelude::*;
 use std::{
-    collections::HashSet,
+    collections::{BTreeSet, HashSet},
     path::{Path, PathBuf},
 };
 
@@ -165,6 +165,16 @@ pub fn load(cameras: &Cameras, config: &LoadConfig) -> Result<Loaded, SceneError
         })
         .collect::<Result<_, SceneError>>()?;
     Ok(Loaded { views, photos: inputs, whole, further, masks: kind, estimate, notes })
+}
+
+/// The files that [`load`] reads: of cameras, photos and masks; each once, sorted. None of them is opened.
+pub fn files(cameras: &Cameras, config: &LoadConfig) -> Result<Vec<PathBuf>, SceneError> {
+    let inputs: Vec<usize> = (0..cameras.photos.len()).filter(|i| !cameras.photos[*i].further).collect();
+    let masks = mask_files(&cameras.photos, &inputs, config)?.into_iter().flatten();
+    let further = cameras.photos.iter().filter(|p| p.further).filter_map(|p| p.mask.clone());
+    let photos = cameras.photos.iter().map(|p| p.image.clone());
+    let all: BTreeSet<PathBuf> = cameras.files.iter().cloned().chain(photos).chain(masks).chain(further).collect();
+    Ok(all.into_iter().collect())
 }
 
 fn opaque(image: &RgbaImage) -> bool {

@@ -40,7 +40,7 @@ pub struct Args {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
-    let scene = args.photos.load(&args.scene, args.up)?;
+    let scene = args.photos.load(args.photos.cameras(&args.scene)?, args.up)?;
     let views = match args.views {
         Some(k) => usize::from(k),
         None => Reconstructor::shipped(&DeviceName::Cpu.open()?)?.views(),
