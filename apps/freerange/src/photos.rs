@@ -7,7 +7,7 @@ use std::{
 
 use freerange::{FrameConfig, Up};
 use freerange_scene::{
-    LoadConfig, Loaded, MaskSource,
+    LoadConfig, Loaded, MaskModel, MaskSource, PixelRange,
     estimate::{Hints, table_faces},
     files, load,
     read::{Cameras, Format, Turntable, cameras},
@@ -31,6 +31,13 @@ pub struct Photos {
     /// or estimate (from poses and colours) [default: the first of these that is there; folders are called masks].
     #[arg(long, value_name = "WHERE", value_parser = parse_masks)]
     masks: Option<MaskSource>,
+    /// Masks from a segmentation network, an ONNX file such as u2netp.onnx: one input (1 x 3 x height x width), the first output is the
+    /// mask. Needs a program built with --features mask-model.
+    #[arg(long, value_name = "FILE", conflicts_with = "masks")]
+    mask_model: Option<PathBuf>,
+    /// What the network takes for pixels: imagenet (mean and deviation), unit (0 to 1), centered (-0.5 to 0.5), signed (-1 to 1).
+    #[arg(long, value_name = "RANGE", default_value = "imagenet", requires = "mask_model", value_parser = parse_range)]
+    mask_model_pixels: PixelRange,
     /// In mask files black is the object.
     #[arg(long)]
     invert_masks: bool,
@@ -97,6 +104,11 @@ fn parse_masks(text: &str) -> Result<MaskSource, String> {
     })
 }
 
+fn parse_range(text: &str) -> Result<PixelRange, String> {
+    let known = PixelRange::ALL.into_iter().find(|(name, _)| *name == text);
+    known.map(|(_, range)| range).ok_or_else(|| "expected imagenet, unit, centered or signed".into())
+}
+
 fn parse_point(text: &str) -> Result<DVec3, String> {
     let numbers: Vec<f64> =
         text.split(',').filter_map(|p| p.trim().parse().ok()).filter(|v: &f64| v.is_finite()).collect();
@@ -125,8 +137,12 @@ impl Photos {
     }
 
     fn config(&self) -> LoadConfig {
+        let masks = match &self.mask_model {
+            Some(file) => MaskSource::Model(MaskModel { file: file.clone(), pixels: self.mask_model_pixels }),
+            None => self.masks.clone().unwrap_or_default(),
+        };
         LoadConfig {
-            masks: self.masks.clone().unwrap_or_default(),
+            masks,
             invert_masks: self.invert_masks,
             max_side: self.max_side,
             hints: Hints { center: self.center, radius: self.radius },
@@ -140,8 +156,9 @@ impl Photos {
 
     /// Name and value of every option.
     pub fn told(&self) -> Vec<(String, String)> {
-        let Self { cameras, turntable, masks, invert_masks, max_side, center, radius } = self;
+        let Self { cameras, turntable, masks, mask_model, mask_model_pixels, invert_masks, max_side, center, radius } = self;
         vec![
+            ("mask-model".into(), format!("{mask_model:?}, {mask_model_pixels:?}")),
             ("cameras".into(), format!("{:?}", cameras.map(Format::name))),
             ("turntable".into(), format!("{turntable:?}")),
             ("masks".into(), format!("{masks:?}")),
