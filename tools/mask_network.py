@@ -1,7 +1,7 @@
 """Reference masks for `--mask-model`: tiny networks, a photo, and what ONNX's own reference evaluator makes of it.
 
 usage: mask_network.py OUT        (needs onnx and numpy; OUT is tests/golden/mask_network)
-OUT/NAME.onnx are networks, OUT/photo.png is 32 x 24 pixels, OUT/expected.json has the object's share of each pixel for each network and
+OUT/NAME.onnx are networks, OUT/photo.png is 16 x 12 pixels, OUT/expected.json has the object's share of each pixel, times 255, for each network and
 range of pixels. `two_inputs` and `four_channels` are to be refused.
 """
 import json
@@ -15,7 +15,7 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 from onnx.reference import ReferenceEvaluator
 
-H, W = 24, 32
+H, W = 12, 16
 RANGES = {
     "imagenet": ([0.485, 0.456, 0.406], [0.229, 0.224, 0.225]),
     "unit": ([0.0] * 3, [1.0] * 3),
@@ -69,7 +69,7 @@ def main():
             if not probabilities:
                 assert mask.min() < 0 or mask.max() > 1
                 mask = 1 / (1 + np.exp(-mask))
-            expected[f"{name}-{key}"] = [round(float(v), 4) for v in mask.ravel()]
+            expected[f"{name}-{key}"] = [round(255 * float(v), 1) for v in mask.ravel()]
     onnx.save(network(True, inputs=2), out / "two_inputs.onnx")
     onnx.save(network(True, channels=4), out / "four_channels.onnx")
     (out / "expected.json").write_text(json.dumps(expected))

@@ -10,7 +10,7 @@ use freerange_scene::{
     LoadConfig, Loaded, MaskModel, MaskSource, PixelRange,
     estimate::{Hints, table_faces},
     files, load,
-    read::{Cameras, Format, Turntable, cameras},
+    read::{Cameras, Format, ReadConfig, Turntable, cameras, cameras_with},
 };
 use glam::DVec3;
 
@@ -27,6 +27,9 @@ pub struct Photos {
     /// add `,cw` for the other way.
     #[arg(long, value_name = "ELEVATION,FOV", conflicts_with = "cameras", allow_hyphen_values = true)]
     turntable: Option<Turntable>,
+    /// The folder of the photos, where they lie apart from the cameras (COLMAP, Polycam, Metashape, RealityCapture).
+    #[arg(long, value_name = "FOLDER")]
+    images: Option<PathBuf>,
     /// Where the object's masks come from: a folder of them (NAME.png, white is the object), alpha, plain (one colour behind the object),
     /// or estimate (from poses and colours) [default: the first of these that is there; folders are called masks].
     #[arg(long, value_name = "WHERE", value_parser = parse_masks)]
@@ -133,7 +136,8 @@ pub struct Scene {
 impl Photos {
     /// Reads the cameras of a scene.
     pub fn cameras(&self, scene: &Path) -> Result<Cameras, CliError> {
-        Ok(cameras(scene, self.cameras, self.turntable.as_ref())?)
+        let Self { cameras: format, turntable, images, .. } = self;
+        Ok(cameras_with(scene, &ReadConfig { format: *format, turntable: *turntable, images: images.clone() })?)
     }
 
     fn config(&self) -> LoadConfig {
@@ -156,11 +160,12 @@ impl Photos {
 
     /// Name and value of every option.
     pub fn told(&self) -> Vec<(String, String)> {
-        let Self { cameras, turntable, masks, mask_model, mask_model_pixels, invert_masks, max_side, center, radius } = self;
+        let Self { cameras, turntable, images, masks, mask_model, mask_model_pixels, invert_masks, max_side, center, radius } = self;
         vec![
             ("mask-model".into(), format!("{mask_model:?}, {mask_model_pixels:?}")),
             ("cameras".into(), format!("{:?}", cameras.map(Format::name))),
             ("turntable".into(), format!("{turntable:?}")),
+            ("images".into(), format!("{images:?}")),
             ("masks".into(), format!("{masks:?}")),
             ("invert-masks".into(), invert_masks.to_string()),
             ("max-side".into(), max_side.to_string()),

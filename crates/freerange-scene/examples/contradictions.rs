@@ -1,6 +1,7 @@
 //! What tells right poses from wrong ones: prints the evidence of generated scenes, with the poses right and wrong in several ways.
 //!
-//! `cargo run --release -p freerange-scene --example contradictions -- FIRST_SEED SCENES [FOLDER]`: photos are written into FOLDER, if given.
+//! `cargo run --release -p freerange-scene --example contradictions -- FIRST_SEED SCENES [FOLDER [KINDS]]`: photos are written into
+//! FOLDER; KINDS are some of right, mixed, shifted, swapped, turned30.
 
 use freerange_camera::View;
 use freerange_scene::estimate::{Compared, Hints, overlap, unjudged};
@@ -33,7 +34,7 @@ fn main() {
     let number = |i: usize| arguments[i].parse::<u64>().expect("a number");
     for seed in number(0)..number(0) + number(1) {
         let (count, turn) = [(8, 6.28), (8, 6.28), (5, 6.28), (12, 6.28), (8, 2.5), (6, 4.0)][(seed % 6) as usize];
-        let scene = tabletop::tabletop(seed, count, turn, (400, 300));
+        let scene = tabletop::tabletop(seed, count, turn, (320, 240));
         if let Some(folder) = arguments.get(2) {
             for v in scene.views.iter().take(2) {
                 v.image.save(format!("{folder}/{seed}-{}.png", v.name)).expect("a folder");
@@ -48,13 +49,15 @@ fn main() {
         let mut swapped: Vec<usize> = (0..count).collect();
         swapped.swap(0, count / 2);
         let v = &scene.views;
-        for (name, views) in [
+        let all = [
             ("right", v.clone()),
             ("mixed", under(v, &order)),
             ("shifted", under(v, &shifted)),
             ("swapped", under(v, &swapped)),
             ("turned30", turned(v, 1, 30.0)),
-        ] {
+        ];
+        let wanted = |name: &str| arguments.get(3).is_none_or(|list| list.split(',').any(|n| n == name));
+        for (name, views) in all.into_iter().filter(|(name, _)| wanted(name)) {
             let began = std::time::Instant::now();
             let found = match unjudged(&views, &Hints::default()) {
                 Ok(found) => found,
