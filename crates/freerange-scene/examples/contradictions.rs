@@ -4,7 +4,7 @@
 //! FOLDER; KINDS are some of right, mixed, shifted, swapped, turned30.
 
 use freerange_camera::View;
-use freerange_scene::estimate::{Compared, Hints, overlap, unjudged};
+use freerange_scene::estimate::{Compared, Hints, contradictions, overlap, unjudged};
 use glam::{DMat4, DQuat, DVec3};
 use rand::{SeedableRng, seq::SliceRandom};
 use rand_chacha::ChaCha8Rng;
@@ -56,6 +56,26 @@ fn main() {
             ("swapped", under(v, &swapped)),
             ("turned30", turned(v, 1, 30.0)),
         ];
+        // True masks, and one of them in another's place.
+        let cut = |order: &[usize]| -> Vec<View> {
+            let same = |i: usize| v[i].image.dimensions() == v[order[i]].image.dimensions();
+            (0..count)
+                .map(|i| {
+                    let mut view = v[i].clone();
+                    let mask = &scene.alone[if same(i) { order[i] } else { i }];
+                    view.image.pixels_mut().zip(mask.pixels()).for_each(|(p, m)| p[3] = m[3]);
+                    view
+                })
+                .collect()
+        };
+        let own: Vec<usize> = (0..count).collect();
+        let replaced: Vec<usize> = (0..count).map(|i| if i == 2 { (2 + count / 2) % count } else { i }).collect();
+        let beside: Vec<usize> = (0..count).map(|i| if i == 2 { 3 } else { i }).collect();
+        for (name, order) in [("masks right", &own), ("one replaced", &replaced), ("by the next", &beside), ("two swapped", &swapped)] {
+            let found = contradictions(&cut(order), DVec3::ZERO, 0.75);
+            let told: Vec<String> = found.iter().map(|c| format!("{c:.3}")).collect();
+            println!("{seed}\t{name}\t{}", told.join(" "));
+        }
         let wanted = |name: &str| arguments.get(3).is_none_or(|list| list.split(',').any(|n| n == name));
         for (name, views) in all.into_iter().filter(|(name, _)| wanted(name)) {
             let began = std::time::Instant::now();

@@ -256,7 +256,8 @@ fn cut_all(
         return Ok((MaskKind::Files, None));
     }
     if let MaskSource::Model(model) = &config.masks {
-        for (view, alpha) in views.iter_mut().zip(network(model, views)?) {
+        let found = network(model, views)?;
+        for (view, alpha) in views.iter_mut().zip(found) {
             set_alpha(&mut view.image, &alpha);
         }
         notes.push(format!("the object was cut out by {}", model.file.display()));

@@ -72,25 +72,19 @@ impl Network {
         let [h, w] = self.size;
         let small = resize_area(&view.image, w as u32, h as u32);
         let (mean, deviation) = pixels.mean_and_deviation();
-        let plane = |c: usize| small.pixels().map(move |p| (f32::from(p[c]) / 255.0 - mean[c]) / deviation[c]);
-        let input: Vec<f32> = (0..3).flat_map(plane).collect();
+        let channel = |c: usize| small.pixels().map(move |p| (f32::from(p[c]) / 255.0 - mean[c]) / deviation[c]);
+        let input: Vec<f32> = (0..3).flat_map(channel).collect();
         let failed = |what: String| In(file).malformed("", format!("the network failed on {}: {what}", view.name));
         let input = Value::from_shape([1, 3, h, w], input).map_err(|e| failed(e.to_string()))?;
         let (from, to) = (self.model.input_ids()[0], self.model.output_ids()[0]);
         let outputs =
             self.model.run(vec![(from, input.into())], &[to], None).map_err(|e| failed(e.to_string()))?;
-        let Some(Value::FloatTensor(output)) = outputs.into_iter().next() else {
-            return Err(In(file).field("", "output", "floating-point numbers", "others"));
+        let Some(output) = outputs.into_iter().next() else {
+            return Err(failed("no output".into()));
         };
-        let shape: Vec<usize> = output.shape().as_ref().to_vec();
-        let (oh, ow) = match shape.as_slice() {
-            [1, 1, h, w] | [1, h, w] | [h, w] if *h > 0 && *w > 0 => (*h, *w),
-            _ => {
-                let found = shape.iter().map(ToString::to_string).collect::<Vec<_>>().join(" x ");
-                return Err(In(file).field("", "output shape", "1 x 1 x height x width", found));
-            }
-        };
-        let mut values: Vec<f32> = output.into_data();
+        let (oh, ow, mut values) = plane(output).map_err(|found| {
+            In(file).field("", "output", "numbers of 32 bits, 1 x 1 x height x width", found)
+        })?;
         if let Some(v) = values.iter().find(|v| !v.is_finite()) {
             return Err(failed(format!("expected finite numbers, found {v}")));
         }
@@ -105,5 +99,22 @@ impl Network {
         let (width, height) = view.image.dimensions();
         let full = image::imageops::resize(&gray, width, height, image::imageops::FilterType::Triangle);
         Ok(full.pixels().map(|p| p[0]).collect())
+    }
+}
+
+/// Height, width and values of a mask, with or without its batch and channel; else what it is instead.
+fn plane(output: Value) -> Result<(usize, usize, Vec<f32>), String> {
+    let told = |shape: &[usize]| shape.iter().map(ToString::to_string).collect::<Vec<_>>().join(" x ");
+    let (shape, values): (Vec<usize>, Vec<f32>) = if let Ok((shape, values)) = output.clone().into_shape_vec::<f32, 4>() {
+        (shape.to_vec(), values)
+    } else if let Ok((shape, values)) = output.clone().into_shape_vec::<f32, 3>() {
+        (shape.to_vec(), values)
+    } else {
+        let (shape, values) = output.into_shape_vec::<f32, 2>().map_err(|e| e.to_string())?;
+        (shape.to_vec(), values)
+    };
+    match shape.as_slice() {
+        [1, 1, h, w] | [1, h, w] | [h, w] if *h > 0 && *w > 0 => Ok((*h, *w, values)),
+        _ => Err(told(&shape)),
     }
 }

@@ -5,7 +5,7 @@
 //! how far the photos differ on the surface of the hull, how far on the table, and how much of each mask the hull of the others leaves out.
 //! Right poses stand out by one of them, unless the scene looks the same from everywhere; wrong ones are as good as any others.
 
-use super::hull::Hull;
+use super::hull::{Hull, Nearly};
 use super::picture::{Picture, bilinear};
 use super::plane::{Plane, across};
 use glam::{DVec3, Vec3};
@@ -21,7 +21,7 @@ const TABLE: usize = 48;
 /// Ways to hand the photos round that are tried, at most.
 const ROUNDS: usize = 11;
 /// Voxels along the longest side of the hulls that are compared.
-const GRID: usize = 48;
+const GRID: usize = 64;
 
 /// A number as it is, and as it is where the photos are handed round.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
@@ -91,12 +91,12 @@ pub fn gather(
         };
         differ(spots.iter().map(|p| (0..count).filter_map(|i| seen(i, *p)).collect()), 3)
     };
-    let left_out = |shift: usize| {
+    let outlines = |shift: usize| {
         let given: Vec<Vec<bool>> =
             (0..count).map(|i| moved(&pictures[i], &pictures[(i + shift) % count], &masks[(i + shift) % count])).collect();
         Some(mean(&outside(pictures, &given, centre, radius)))
     };
-    Evidence { surface: compared(&on_surface), table: compared(&on_table), outline: compared(&left_out) }
+    Evidence { surface: compared(&on_surface), table: compared(&on_table), outline: compared(&outlines) }
 }
 
 fn mean(values: &[f64]) -> f64 {
@@ -105,15 +105,28 @@ fn mean(values: &[f64]) -> f64 {
 
 /// For each view: the share of its mask that the hull of the other masks does not cover.
 pub fn outside(pictures: &[Picture], masks: &[Vec<bool>], centre: DVec3, radius: f64) -> Vec<f64> {
-    (0..pictures.len())
+    let nearly = Nearly::carve(pictures, masks, centre, radius, GRID);
+    (0..pictures.len()).map(|i| left_out(&masks[i], &nearly.without(&[i]).outline(&pictures[i]))).collect()
+}
+
+/// The share of a mask that an outline does not cover.
+fn left_out(mask: &[bool], outline: &[bool]) -> f64 {
+    let size = mask.iter().filter(|m| **m).count().max(1) as f64;
+    mask.iter().zip(outline).filter(|(m, o)| **m && !**o).count() as f64 / size
+}
+
+/// For each view, how far its mask and those of the others contradict each other, 0 to 1: the share of it that the hull of the others
+/// does not cover, or the share of the others' masks, on average, that no hull covers because of it; the larger of both.
+pub fn contradictions(pictures: &[Picture], masks: &[Vec<bool>], centre: DVec3, radius: f64) -> Vec<f64> {
+    let count = pictures.len();
+    let nearly = Nearly::carve(pictures, masks, centre, radius, GRID);
+    let share = |of: usize, without: &[usize]| left_out(&masks[of], &nearly.without(without).outline(&pictures[of]));
+    let own: Vec<f64> = (0..count).into_par_iter().map(|i| share(i, &[i])).collect();
+    (0..count)
+        .into_par_iter()
         .map(|i| {
-            // An all-white mask says nothing; it stands for the one that is left out.
-            let mut others = masks.to_vec();
-            others[i] = vec![true; masks[i].len()];
-            let size = masks[i].iter().filter(|m| **m).count().max(1) as f64;
-            let outline = Hull::carve(pictures, &others, centre, radius, None, 0, GRID).map(|h| h.outline(&pictures[i]));
-            let out = |k: usize| masks[i][k] && outline.as_ref().is_none_or(|o| !o[k]);
-            (0..masks[i].len()).filter(|k| out(*k)).count() as f64 / size
+            let spared: f64 = (0..count).filter(|j| *j != i).map(|j| own[j] - share(j, &[i, j])).sum();
+            own[i].max(spared / (count - 1).max(1) as f64)
         })
         .collect()
 }

@@ -610,6 +610,14 @@ pub fn agreement(views: &[View], centre: DVec3, radius: f64) -> Vec<f64> {
     }
 }
 
+/// How far each mask (the views' alpha) and those of the others contradict each other, 0 to 1: the share of it that lies outside of the
+/// others' hull, or the share of the others that it alone keeps out of the hull, on average; the larger of both. For three views or more.
+pub fn contradictions(views: &[View], centre: DVec3, radius: f64) -> Vec<f64> {
+    let pictures: Vec<Picture> = views.par_iter().map(|v| Picture::of(v, SMALL)).collect();
+    let masks: Vec<Vec<bool>> = pictures.iter().map(|p| p.valid.clone()).collect();
+    evidence::contradictions(&pictures, &masks, centre, radius)
+}
+
 /// The direction in which the plane faces that the object stands on, where one stands out. `views`: the object cut out; `whole`: the
 /// photos with what is around it, in the same order.
 pub fn table_faces(views: &[View], whole: &[RgbaImage]) -> Option<DVec3> {

@@ -1,6 +1,6 @@
 //! Photos that are held out for validation.
 
-use std::{convert::Infallible, str::FromStr};
+use std::{collections::BTreeSet, convert::Infallible, str::FromStr};
 
 use freerange::View;
 
@@ -30,28 +30,28 @@ impl FromStr for Holdout {
 impl Holdout {
     /// Takes the photos out of `views`. At least two stay.
     pub fn take(&self, views: &mut Vec<View>) -> Result<Vec<View>, CliError> {
-        let out = self.chosen(views)?;
         let most = views.len().saturating_sub(2);
-        if out.len() > most {
-            let text = format!("--holdout: expected at most {most} of {} photos, found {}", views.len(), out.len());
-            return Err(CliError::input(text));
-        }
+        let few = |count: usize| match count <= most {
+            true => Ok(()),
+            false => {
+                let all = views.len();
+                Err(CliError::input(format!("--holdout: expected at most {most} of {all} photos, found {count}")))
+            }
+        };
+        let out: BTreeSet<usize> = match self {
+            Self::Count(count) => {
+                few(*count)?;
+                (0..*count).map(|i| (2 * i + 1) * views.len() / (2 * count)).collect()
+            }
+            Self::Names(names) => names.iter().map(|name| place(name, views)).collect::<Result<_, _>>()?,
+        };
+        few(out.len())?;
         let (mut held, mut kept) = (Vec::new(), Vec::new());
         for (i, view) in std::mem::take(views).into_iter().enumerate() {
             if out.contains(&i) { held.push(view) } else { kept.push(view) }
         }
         *views = kept;
         Ok(held)
-    }
-
-    fn chosen(&self, views: &[View]) -> Result<Vec<usize>, CliError> {
-        let all = views.len();
-        match self {
-            // More than there are is refused by number.
-            Self::Count(count) if *count > all => Ok((0..*count).collect()),
-            Self::Count(count) => Ok((0..*count).map(|i| (2 * i + 1) * all / (2 * count)).collect()),
-            Self::Names(names) => names.iter().map(|name| place(name, views)).collect(),
-        }
     }
 }
 
