@@ -160,7 +160,18 @@ impl Photos {
 
     /// Name and value of every option.
     pub fn told(&self) -> Vec<(String, String)> {
-        let Self { cameras, turntable, images, masks, mask_model, mask_model_pixels, invert_masks, max_side, center, radius } = self;
+        let Self {
+            cameras,
+            turntable,
+            images,
+            masks,
+            mask_model,
+            mask_model_pixels,
+            invert_masks,
+            max_side,
+            center,
+            radius,
+        } = self;
         vec![
             ("mask-model".into(), format!("{mask_model:?}, {mask_model_pixels:?}")),
             ("cameras".into(), format!("{:?}", cameras.map(Format::name))),

@@ -92,7 +92,10 @@ fn many_scenes_are_made_once_and_a_bad_one_ends_none() {
     // Other options are refused before anything is made, unless all is to be made anew.
     let (code, _, said) = made(&list, &out, &["--seed", "3"]);
     assert_eq!(code, 2);
-    assert!(said.contains("scene.json") && said.contains("`seeds`: expected [0]") && said.contains("--restart"), "{said}");
+    assert!(
+        said.contains("scene.json") && said.contains("`seeds`: expected [0]") && said.contains("--restart"),
+        "{said}"
+    );
     assert_eq!(changed(&out.join("a-bowl/gaussians.ply")), before);
     let (code, rows, said) = made(&list, &out, &["--seed", "3", "--restart", "--share", "0/2"]);
     assert_eq!((code, column(&rows, "scene")), (0, vec!["a-bowl", "b-bowl"]), "{said}");
@@ -131,7 +134,8 @@ fn photos_held_out_are_compared_with_and_not_used() {
     let out = place.path().join("out");
     let args = |holdout: &'static str| {
         let (scene, out) = (example().to_str().unwrap().to_owned(), out.to_str().unwrap().to_owned());
-        let words = ["reconstruct", &scene, "-o", &out, "--steps", "1", "--refine", "2", "--json", "--holdout", holdout];
+        let words =
+            ["reconstruct", &scene, "-o", &out, "--steps", "1", "--refine", "2", "--json", "--holdout", holdout];
         words.map(ToOwned::to_owned)
     };
     let run = |holdout: &'static str| freerange(&args(holdout).each_ref().map(String::as_str));

@@ -71,7 +71,9 @@ fn main() {
         let own: Vec<usize> = (0..count).collect();
         let replaced: Vec<usize> = (0..count).map(|i| if i == 2 { (2 + count / 2) % count } else { i }).collect();
         let beside: Vec<usize> = (0..count).map(|i| if i == 2 { 3 } else { i }).collect();
-        for (name, order) in [("masks right", &own), ("one replaced", &replaced), ("by the next", &beside), ("two swapped", &swapped)] {
+        for (name, order) in
+            [("masks right", &own), ("one replaced", &replaced), ("by the next", &beside), ("two swapped", &swapped)]
+        {
             let found = contradictions(&cut(order), DVec3::ZERO, 0.75);
             let told: Vec<String> = found.iter().map(|c| format!("{c:.3}")).collect();
             println!("{seed}\t{name}\t{}", told.join(" "));
@@ -95,7 +97,8 @@ fn main() {
             let mean = |v: &[f64]| v.iter().sum::<f64>() / v.len() as f64;
             let least = |v: &[f64]| v.iter().copied().fold(1.0, f64::min);
             let e = &found.evidence;
-            let show = |c: Option<Compared>| c.map_or("-".into(), |c| format!("{:.3} {:.3} {:.3}", c.own, c.others, c.least));
+            let show =
+                |c: Option<Compared>| c.map_or("-".into(), |c| format!("{:.3} {:.3} {:.3}", c.own, c.others, c.least));
             println!(
                 "{seed}\t{name}\tagree {:.3} {:.3}\tclear {:.3}\tsurface {}\ttable {}\toutline {}\tup {}\tIoU {:.3} {:.3}\t{:.1}s\t{}",
                 mean(&found.agreement),

@@ -77,14 +77,12 @@ impl Network {
         let failed = |what: String| In(file).malformed("", format!("the network failed on {}: {what}", view.name));
         let input = Value::from_shape([1, 3, h, w], input).map_err(|e| failed(e.to_string()))?;
         let (from, to) = (self.model.input_ids()[0], self.model.output_ids()[0]);
-        let outputs =
-            self.model.run(vec![(from, input.into())], &[to], None).map_err(|e| failed(e.to_string()))?;
+        let outputs = self.model.run(vec![(from, input.into())], &[to], None).map_err(|e| failed(e.to_string()))?;
         let Some(output) = outputs.into_iter().next() else {
             return Err(failed("no output".into()));
         };
-        let (oh, ow, mut values) = plane(output).map_err(|found| {
-            In(file).field("", "output", "numbers of 32 bits, 1 x 1 x height x width", found)
-        })?;
+        let (oh, ow, mut values) = plane(output)
+            .map_err(|found| In(file).field("", "output", "numbers of 32 bits, 1 x 1 x height x width", found))?;
         if let Some(v) = values.iter().find(|v| !v.is_finite()) {
             return Err(failed(format!("expected finite numbers, found {v}")));
         }
@@ -105,7 +103,8 @@ impl Network {
 /// Height, width and values of a mask, with or without its batch and channel; else what it is instead.
 fn plane(output: Value) -> Result<(usize, usize, Vec<f32>), String> {
     let told = |shape: &[usize]| shape.iter().map(ToString::to_string).collect::<Vec<_>>().join(" x ");
-    let (shape, values): (Vec<usize>, Vec<f32>) = if let Ok((shape, values)) = output.clone().into_shape_vec::<f32, 4>() {
+    let (shape, values): (Vec<usize>, Vec<f32>) = if let Ok((shape, values)) = output.clone().into_shape_vec::<f32, 4>()
+    {
         (shape.to_vec(), values)
     } else if let Ok((shape, values)) = output.clone().into_shape_vec::<f32, 3>() {
         (shape.to_vec(), values)

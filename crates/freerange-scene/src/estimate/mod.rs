@@ -17,7 +17,7 @@ pub use evidence::{Compared, Evidence};
 pub use hull::overlap;
 
 use crate::SceneError;
-use freerange_camera::View;
+use freerange_camera::{View, cameras_up};
 use glam::{DMat3, DVec3, Vec3};
 use hull::{Floor, Hull, reaches_border};
 use image::RgbaImage;
@@ -91,14 +91,15 @@ impl Estimate {
     /// Why these masks should not be used, if views and poses do not belong together.
     fn contradiction(&self, views: &[View]) -> Option<String> {
         let mean = self.agreement.iter().sum::<f64>() / self.agreement.len() as f64;
-        if mean >= LEAST_AGREEMENT {
-            return None;
-        }
+        let found = if mean < LEAST_AGREEMENT {
+            format!("masks and their common hull agree to {:.0} %", 100.0 * mean)
+        } else {
+            self.evidence.against()?
+        };
         let worst = (0..views.len()).min_by(|a, b| self.agreement[*a].total_cmp(&self.agreement[*b])).unwrap_or(0);
         Some(format!(
-            "the views contradict each other (masks and their common hull agree to {:.0} %, least in {}): the poses may be wrong, or \
-             the object moved, or it cannot be told from the background",
-            100.0 * mean,
+            "the views contradict each other ({found}; {} agrees least): the poses may be wrong or belong to other photos, or the object \
+             moved, or it cannot be told from the background",
             views[worst].name
         ))
     }
@@ -203,10 +204,9 @@ fn meeting_point(views: &[View]) -> Option<DVec3> {
     (point.is_finite() && views.iter().all(ahead)).then_some(point)
 }
 
-/// Where the tops of the photos point, on average.
+/// Which way is up, as far as the cameras tell.
 fn mean_up(views: &[View]) -> DVec3 {
-    let own = |v: &View| -DMat3::from_mat4(v.camera.world_to_camera).transpose().y_axis;
-    views.iter().map(own).sum::<DVec3>().try_normalize().unwrap_or(DVec3::Z)
+    cameras_up(views).unwrap_or(DVec3::Z)
 }
 
 /// How far the ray through a pixel passes by `centre`.

@@ -232,7 +232,8 @@ fn read(format: Format, file: &Path, images: Option<&Path>) -> Result<Cameras, S
     match format {
         Format::Transforms if images.is_some() => Err(SceneError::Option {
             option: "--images",
-            expected: "cameras that do not say where their photos are (colmap, polycam, metashape, realitycapture)".into(),
+            expected: "cameras that do not say where their photos are (colmap, polycam, metashape, realitycapture)"
+                .into(),
             found: "transforms.json, which does".into(),
         }),
         Format::Transforms => transforms::read(file),

@@ -109,8 +109,7 @@ pub fn tabletop(seed: u64, count: usize, turn: f64, size: (u32, u32)) -> Tableto
     let lighting: Lighting = LightingConfig { default_share: 0.2, ..LightingConfig::default() }.sample(&mut rng);
     let config = GeneratorConfig::default();
     let mesh = generate(seed, &config).unwrap();
-    let cloth =
-        [Cloth::Wood, Cloth::Checks, Cloth::Speckles, Cloth::Plain, Cloth::Print][rng.random_range(0..5)];
+    let cloth = [Cloth::Wood, Cloth::Checks, Cloth::Speckles, Cloth::Plain, Cloth::Print][rng.random_range(0..5)];
     let kind = freerange_mesh::kind_of(seed, &config).unwrap();
     let mut colour = || {
         let value: f32 = rng.random_range(0.08..0.7);

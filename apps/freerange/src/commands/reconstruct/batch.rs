@@ -220,11 +220,7 @@ fn options(args: &Args, model: &Reconstructor) -> Result<BTreeMap<String, String
     Ok(told)
 }
 
-fn same_options(
-    file: &Path,
-    were: &BTreeMap<String, String>,
-    are: &BTreeMap<String, String>,
-) -> Result<(), CliError> {
+fn same_options(file: &Path, were: &BTreeMap<String, String>, are: &BTreeMap<String, String>) -> Result<(), CliError> {
     let names: BTreeSet<&String> = were.keys().chain(are.keys()).collect();
     let none = "nothing".to_owned();
     match names.into_iter().find(|n| were.get(*n) != are.get(*n)) {
@@ -368,7 +364,8 @@ mod tests {
 
     #[test]
     fn other_options_are_named() {
-        let options = |refine: &str| BTreeMap::from([("a".to_owned(), "1".to_owned()), ("refine".into(), refine.into())]);
+        let options =
+            |refine: &str| BTreeMap::from([("a".to_owned(), "1".to_owned()), ("refine".into(), refine.into())]);
         assert!(same_options(Path::new("x/scene.json"), &options("500"), &options("500")).is_ok());
         let text = same_options(Path::new("x/scene.json"), &options("500"), &options("0")).unwrap_err().to_string();
         assert!(["x/scene.json", "`refine`", "expected 500", "found 0"].iter().all(|w| text.contains(w)), "{text}");
