@@ -55,12 +55,13 @@ pub struct Evidence {
 /// Share of the masks outside of the others' hull above which poses are doubted, alone and of what it is where photos are handed round. On
 /// generated scenes: up to 0.02 and 0.04 of it with right poses; with mixed ones from 0.16 and 0.45, with two photos exchanged from 0.08
 /// and 0.24.
-const OUTSIDE: f64 = 0.06;
-const OF_OTHERS: f64 = 0.2;
+const OUTSIDE: f64 = 0.05;
+const OF_OTHERS: f64 = 0.12;
 /// A table that differs so much where photos are handed round (Lab) tells right poses from wrong ones: on it right ones have at most 0.15 of
 /// that, mixed ones 0.7 and more.
 const TELLING: f64 = 2.5;
 const OF_TELLING: f64 = 0.6;
+const OF_CONFIRMED: f64 = 0.8;
 
 impl Evidence {
     /// What speaks against the poses, if anything does.
@@ -69,9 +70,10 @@ impl Evidence {
         if let Some(o) = self.outline.filter(|o| o.own > OUTSIDE && o.own > OF_OTHERS * o.others) {
             return Some(format!("{} % of the masks lie outside of the others' hull", percent(o.own)));
         }
-        // Right poses have been seen to matter.
+        // The ground need not be flat where outlines speak for the poses.
         let confirmed = self.outline.is_some_and(|o| o.others > OUTSIDE && o.own < 0.5 * OF_OTHERS * o.others);
-        let table = self.table.filter(|t| !confirmed && t.others > TELLING && t.own > OF_TELLING * t.others)?;
+        let most = if confirmed { OF_CONFIRMED } else { OF_TELLING };
+        let table = self.table.filter(|t| t.others > TELLING && t.own > most * t.others)?;
         let of = percent(table.own / table.others);
         Some(format!("photos differ on the table {of} % as much as under each other's poses"))
     }
