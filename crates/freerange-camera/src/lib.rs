@@ -14,7 +14,9 @@ mod square;
 
 pub use camera::{Camera, View};
 pub use error::{CameraError, Place};
-pub use frame::{CANONICAL_RADIUS, CanonicalFrame, FrameConfig, Similarity, Up, canonical_from_user, outline_radius};
+pub use frame::{
+    CANONICAL_RADIUS, CanonicalFrame, FrameConfig, Similarity, Up, cameras_up, canonical_from_user, outline_radius,
+};
 pub use lens::Lens;
 pub use plucker::{PatchLayout, plucker};
 pub use scene::{Scene, load_cameras, transforms_json};
