@@ -31,6 +31,8 @@ enum Command {
     Reconstruct(commands::reconstruct::Args),
     /// Show what is understood of a scene: cameras, masks, place and size, and what may go wrong.
     Inspect(commands::inspect::Args),
+    /// Serve a page: drop photos with cameras, mend masks, and watch the Gaussians appear.
+    Serve(Box<commands::serve::Args>),
     /// Render Gaussians from given cameras.
     Render(commands::render::Args),
     /// Convert Gaussians between file formats, or into a page that shows them.
@@ -77,6 +79,7 @@ fn main() -> ExitCode {
     let result = match cli.command {
         Command::Reconstruct(args) => commands::reconstruct::run(&args),
         Command::Inspect(args) => commands::inspect::run(&args),
+        Command::Serve(args) => commands::serve::run(&args),
         Command::Render(args) => commands::render::run(&args),
         Command::Convert(args) => commands::convert::run(&args),
         Command::Eval(args) => commands::eval::run(&args),

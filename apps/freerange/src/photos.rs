@@ -8,9 +8,10 @@ use std::{
 use freerange::{FrameConfig, Up};
 use freerange_scene::{
     LoadConfig, Loaded, MaskModel, MaskSource, PixelRange,
-    estimate::{Hints, table_faces},
+    estimate::Hints,
     files, load,
     read::{Cameras, Format, ReadConfig, Turntable, cameras, cameras_with},
+    up_of,
 };
 use glam::DVec3;
 
@@ -189,18 +190,13 @@ impl Photos {
     pub fn load(&self, cameras: Cameras, up: UpChoice) -> Result<Scene, CliError> {
         let loaded = load(&cameras, &self.config())?;
         let mut notes: Vec<String> = cameras.notes.iter().chain(&loaded.notes).cloned().collect();
-        let up = match (up, cameras.format) {
-            (UpChoice::Told(up), _) => up,
-            (UpChoice::Auto, Format::Colmap | Format::Metashape) => {
-                let table = match &loaded.estimate {
-                    Some(estimate) => estimate.up,
-                    None => table_faces(&loaded.views, &loaded.whole),
-                };
-                let whence = if table.is_some() { "what the object stands on" } else { "the cameras" };
-                notes.push(format!("up is taken from {whence}; --up says otherwise"));
-                table.map_or(Up::Cameras, Up::Direction)
+        let up = match up {
+            UpChoice::Told(up) => up,
+            UpChoice::Auto => {
+                let (up, note) = up_of(&cameras, &loaded);
+                notes.extend(note);
+                up
             }
-            (UpChoice::Auto, _) => Up::Z,
         };
         let frame = FrameConfig { up, center: self.center, radius: self.radius, ..FrameConfig::default() };
         Ok(Scene { cameras, loaded, frame, notes })

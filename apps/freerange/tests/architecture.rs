@@ -8,6 +8,7 @@ const ROOMS: &[(&str, &[&str])] = &[
     ("freerange-camera", &[]),
     ("freerange-scene", &["freerange-camera"]),
     ("freerange-formats", &["freerange-splat"]),
+    ("freerange-serve", &["freerange-splat", "freerange-camera", "freerange-scene", "freerange-formats"]),
     ("freerange-hub", &[]),
     ("freerange-raster", &["freerange-camera"]),
     ("freerange-model", &["freerange-splat"]),

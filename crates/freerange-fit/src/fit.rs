@@ -27,7 +27,7 @@ pub fn fit(
     views: &[View],
     initial: Option<&Cloud>,
     config: &FitConfig,
-    progress: impl FnMut(&FitProgress) -> ControlFlow<()>,
+    progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Cloud, FitError> {
     config.check()?;
     let targets = Targets::new(views, config.render_size)?;
@@ -46,7 +46,7 @@ pub(crate) fn optimise(
     config: &FitConfig,
     rng: &mut ChaCha8Rng,
     mut more: impl FnMut(&mut Objective, &Cloud, [f32; 3]) -> Result<(), FitError>,
-    mut progress: impl FnMut(&FitProgress) -> ControlFlow<()>,
+    mut progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Cloud, FitError> {
     let mut adam = Adam::default();
     let mut queue = Vec::new();
@@ -72,8 +72,8 @@ pub(crate) fn optimise(
         add_noise(&mut cloud, config.noise * mean_rate, config.dead_opacity, rng);
         check_cloud(&cloud, step)?;
 
-        let now = FitProgress { step: step + 1, steps: config.iterations, loss, gaussians: cloud.len() };
-        if progress(&now).is_break() {
+        let (step, steps, gaussians) = (step + 1, config.iterations, cloud.len());
+        if progress(&FitProgress { step, steps, loss, gaussians, cloud: &cloud }).is_break() {
             break;
         }
     }

@@ -28,9 +28,11 @@ pub use frame::frame_of;
 pub use quick::{QuickFitConfig, quick_fit, tree_slice};
 pub use refine::refine;
 
+use freerange_splat::Cloud;
+
 /// How far [`fit`] or [`refine`] has come.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct FitProgress {
+pub struct FitProgress<'a> {
     /// Steps done.
     pub step: usize,
     /// Steps in all.
@@ -39,4 +41,6 @@ pub struct FitProgress {
     pub loss: f64,
     /// Number of Gaussians.
     pub gaussians: usize,
+    /// The Gaussians by now, in the frame of the views.
+    pub cloud: &'a Cloud,
 }

@@ -58,7 +58,7 @@ pub fn quick_fit(
     views: &[View],
     config: &QuickFitConfig,
     seed: u64,
-    progress: impl FnMut(&FitProgress) -> ControlFlow<()>,
+    progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Cloud, FitError> {
     config.check()?;
     fit(views, None, &config.config(seed), progress)

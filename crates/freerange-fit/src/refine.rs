@@ -28,7 +28,7 @@ pub fn refine(
     others: &[Cloud],
     views: &[View],
     config: &RefineConfig,
-    progress: impl FnMut(&FitProgress) -> ControlFlow<()>,
+    progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Cloud, FitError> {
     config.check()?;
     let targets = Targets::new(views, config.render_size)?;

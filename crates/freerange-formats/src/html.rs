@@ -11,7 +11,7 @@ use crate::{Encoded, Frame, Loaded, error::Problem, quantize::Row};
 
 const PAGE: &str = include_str!("viewer/page.html");
 const STYLE: &str = include_str!("viewer/style.css");
-const SCRIPT: &str = include_str!("viewer/viewer.js");
+const SCRIPT: &str = crate::viewer::SCRIPT;
 
 /// What stands before and after the Gaussians; the page is ours alone, so that this need not be parsed as HTML.
 const BEFORE: &str = "<script type=\"application/octet-stream\" id=\"gaussians\" data-up=\"";

@@ -25,6 +25,7 @@ mod sog_read;
 mod splat;
 mod spz;
 mod spz_read;
+pub mod viewer;
 
 use std::{fmt, fs::File, io::Read, io::Write, path::Path};
 

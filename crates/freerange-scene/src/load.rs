@@ -4,9 +4,9 @@ use crate::{
     SceneError,
     error::In,
     estimate::{self, Estimate, Hints},
-    read::{Cameras, IMAGES, LARGEST_SIDE, Photo, inside},
+    read::{Cameras, Format, IMAGES, LARGEST_SIDE, Photo, inside},
 };
-use freerange_camera::{Camera, Lens, View, image_ops::resize_area, scene::cut_out};
+use freerange_camera::{Camera, Lens, Up, View, image_ops::resize_area, scene::cut_out};
 use image::{DynamicImage, GrayImage, ImageDecoder, ImageReader, Luma, Rgba, RgbaImage, metadata::Orientation};
 use rayon::prelude::*;
 use std::{
@@ -548,4 +548,18 @@ fn size_of(path: &Path) -> Result<(u32, u32), SceneError> {
     let failed = |e| SceneError::Image { file: path.into(), source: Box::new(e) };
     let reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(|e| In(path).read(e))?;
     reader.into_dimensions().map_err(failed)
+}
+
+/// Which way is up where nobody says so, and what the user should know of it: +z where that is the format's rule, else where the table faces,
+/// else the cameras' own.
+pub fn up_of(cameras: &Cameras, loaded: &Loaded) -> (Up, Option<String>) {
+    if !matches!(cameras.format, Format::Colmap | Format::Metashape) {
+        return (Up::Z, None);
+    }
+    let table = match &loaded.estimate {
+        Some(estimate) => estimate.up,
+        None => estimate::table_faces(&loaded.views, &loaded.whole),
+    };
+    let whence = if table.is_some() { "what the object stands on" } else { "the cameras" };
+    (table.map_or(Up::Cameras, Up::Direction), Some(format!("up is taken from {whence}; --up says otherwise")))
 }

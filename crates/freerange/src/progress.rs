@@ -53,7 +53,16 @@ pub struct Progress<'a> {
     pub total: usize,
     /// The photometric loss of the last step of a fit or a refinement.
     pub loss: Option<f64>,
-    pub(crate) estimate: Option<(&'a Estimate<'a>, &'a Similarity)>,
+    pub(crate) estimate: Option<(Known<'a>, &'a Similarity)>,
+}
+
+/// What is known of the Gaussians at a step.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Known<'a> {
+    /// The state of a fit or a refinement.
+    Fitted(&'a Cloud),
+    /// The network's estimates, one per seed.
+    Sampled(&'a Estimate<'a>),
 }
 
 impl<'a> Progress<'a> {
@@ -61,14 +70,19 @@ impl<'a> Progress<'a> {
         Self { stage, sample: 0, done, total, loss: None, estimate: None }
     }
 
-    /// While sampling: what the network takes the clean Gaussians of each sample to be, in the frame of the views. None in
-    /// other stages, when sampling begins, and for what is sampled only to help (`sample.ensemble`). Costs a copy; on a GPU it waits for the step.
+    /// What the Gaussians are by now, in the frame of the views: the state of a fit, one cloud, which all samples start from; while sampling,
+    /// what the network takes the clean Gaussians of each sample to be; while refining, the state of sample [`Progress::sample`], one cloud.
+    /// Those of an ensemble's other members come, too. None when a stage begins. Costs a copy; on a GPU it waits for the step. Whether it
+    /// is called changes no result.
     ///
     /// # Errors
     /// If a device fails.
     pub fn estimate(&self) -> Result<Option<Vec<Cloud>>, Error> {
-        let Some((estimate, canonical_from_user)) = self.estimate else { return Ok(None) };
-        let clouds = estimate.clouds()?.into_iter().flatten();
-        Ok(Some(clouds.map(|cloud| to_user(&cloud, canonical_from_user)).collect()))
+        let Some((known, place)) = self.estimate else { return Ok(None) };
+        let clouds = match known {
+            Known::Fitted(cloud) => vec![cloud.clone()],
+            Known::Sampled(estimate) => estimate.clouds()?.into_iter().flatten().collect(),
+        };
+        Ok(Some(clouds.iter().map(|cloud| to_user(cloud, place)).collect()))
     }
 }

@@ -9,7 +9,7 @@ use freerange_flow::sample::{Estimate, SampleConfig, StartConfig, reconstruct};
 use freerange_model::Checkpoint;
 use freerange_splat::Cloud;
 
-use crate::{EncoderPlaces, Error, Options, Progress, Stage, load_checkpoint, require};
+use crate::{EncoderPlaces, Error, Options, Progress, Stage, load_checkpoint, progress::Known, require};
 
 /// A model on a device, ready to reconstruct one object after the other.
 #[derive(Clone, Debug)]
@@ -161,7 +161,9 @@ impl Reconstructor {
             for member in 0..members {
                 let done = [member * config.iterations, members * config.iterations];
                 let seed = member as u64;
-                let mut fit = watched(Stage::Fit, 0, &mut tell, done, |p| quick_fit(&shown, config, seed, p))?;
+                // The other members only help the first: nobody is shown them.
+                let place = (member == 0).then_some(&frame.canonical_from_user);
+                let mut fit = watched(Stage::Fit, 0, place, &mut tell, done, |p| quick_fit(&shown, config, seed, p))?;
                 // The fit knows better than the masks where the object is; it moves along, so that one is enough.
                 if member == 0 && !frame.kept {
                     let correction = frame_of(&fit, &shown)?;
@@ -185,8 +187,8 @@ impl Reconstructor {
         for member in 0..members {
             let told = |estimate: &Estimate<'_>| {
                 let told = Progress::new(Stage::Sample, member * steps + estimate.index + 1, total);
-                // The other members only help the first.
-                tell(&Progress { estimate: (member == 0).then_some((estimate, &canonical_from_user)), ..told })
+                let known = (member == 0).then_some((Known::Sampled(estimate), &canonical_from_user));
+                tell(&Progress { estimate: known, ..told })
             };
             let sampled = self.sample(&shown, fits.get(member), options, member as u64, told)?;
             clouds.iter_mut().zip(sampled).for_each(|(members, cloud)| members.push(cloud));
@@ -207,8 +209,8 @@ impl Reconstructor {
                     };
                     let config = RefineConfig { steps, hold, seed, ..RefineConfig::default() };
                     let refined =
-                        |p: &mut dyn FnMut(&FitProgress) -> _| refine(&plain, &members, &canonical, &config, p);
-                    Some(watched(Stage::Refine, i, &mut tell, [0, steps], refined)?)
+                        |p: &mut dyn FnMut(&FitProgress<'_>) -> _| refine(&plain, &members, &canonical, &config, p);
+                    Some(watched(Stage::Refine, i, Some(&canonical_from_user), &mut tell, [0, steps], refined)?)
                 }
             };
             let (canonical, unrefined) = match refined {
@@ -288,16 +290,19 @@ pub fn choose_views(views: &[View], most: usize) -> Result<Vec<usize>, Error> {
 fn watched(
     stage: Stage,
     sample: usize,
+    canonical_from_user: Option<&Similarity>,
     tell: &mut impl FnMut(&Progress<'_>) -> Result<(), Error>,
     [before, total]: [usize; 2],
-    fit: impl FnOnce(&mut dyn FnMut(&FitProgress) -> ControlFlow<()>) -> Result<Cloud, freerange_fit::FitError>,
+    fit: impl FnOnce(&mut dyn FnMut(&FitProgress<'_>) -> ControlFlow<()>) -> Result<Cloud, freerange_fit::FitError>,
 ) -> Result<Cloud, Error> {
     if before == 0 {
         tell(&Progress { sample, ..Progress::new(stage, 0, total) })?;
     }
     let mut stopped = Ok(());
     let cloud = fit(&mut |p| {
-        stopped = tell(&Progress { sample, loss: Some(p.loss), ..Progress::new(stage, before + p.step, total) });
+        let estimate = canonical_from_user.map(|place| (Known::Fitted(p.cloud), place));
+        let loss = Some(p.loss);
+        stopped = tell(&Progress { sample, loss, estimate, ..Progress::new(stage, before + p.step, total) });
         if stopped.is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
     });
     stopped?;

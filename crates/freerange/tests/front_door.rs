@@ -49,9 +49,9 @@ fn every_step_is_told_and_the_last_estimate_is_the_result_in_the_users_frame() {
         .run(&views, &options, &mut |p| {
             told.push((p.stage, p.sample, p.done, p.total));
             let estimate = p.estimate().unwrap();
-            assert_eq!(estimate.is_some(), p.stage == Stage::Sample && p.done > 0);
+            assert_eq!(estimate.is_some(), p.done > 0);
             assert_eq!(p.loss.is_some(), matches!(p.stage, Stage::Fit | Stage::Refine) && p.done > 0);
-            estimates.extend(estimate);
+            estimates.extend(estimate.map(|clouds| (p.stage, p.sample, clouds)));
             ControlFlow::Continue(())
         })
         .unwrap();
@@ -69,7 +69,26 @@ fn every_step_is_told_and_the_last_estimate_is_the_result_in_the_users_frame() {
         [Stage::Frame, Stage::Fit, Stage::Sample, Stage::Refine]
     );
     let unrefined: Vec<_> = result.samples.iter().map(|s| s.unrefined.clone().unwrap()).collect();
-    assert!(estimates.len() == 3 && estimates[2] == unrefined && estimates[1] != unrefined);
+    let of = |stage, sample| {
+        let of = estimates.iter().filter(move |e| (e.0, e.1) == (stage, sample));
+        of.map(|e| e.2.clone()).collect::<Vec<_>>()
+    };
+    let sampled = of(Stage::Sample, 0);
+    assert!(sampled.len() == 3 && sampled[2] == unrefined && sampled[1] != unrefined);
+    // Of fits and refinements the states: the last one of a refinement is the result.
+    let fitted = of(Stage::Fit, 0);
+    assert!(fitted.len() == 20 && fitted.windows(2).all(|pair| pair[0].len() == 1 && pair[0] != pair[1]));
+    let before = score(&fitted[0][0], &views).unwrap().unwrap().psnr;
+    let after = score(&fitted[19][0], &views).unwrap().unwrap().psnr;
+    assert!(before > 10.0 && after > before, "in the frame of the cameras, and better: {before} dB, {after} dB");
+    for (i, sample) in result.samples.iter().enumerate() {
+        let refined = of(Stage::Refine, i);
+        assert_eq!(refined.len(), 4);
+        assert!(refined[3][0].len() == sample.gaussians.len() && refined[0] != refined[3]);
+        // But for the labels of axes, which are made canonical at the end.
+        let means = |cloud: &freerange::Cloud| (0..cloud.len()).map(|k| cloud.mean(k)).collect::<Vec<_>>();
+        assert_eq!(means(&refined[3][0]), means(&sample.gaussians));
+    }
     assert_eq!(result.samples.iter().map(|s| s.seed).collect::<Vec<_>>(), [4, 5]);
     assert_ne!(unrefined[0], unrefined[1]);
     // In the frame of the cameras: what is seen there is the bowl.
@@ -102,7 +121,7 @@ fn an_ensemble_holds_the_refinement_of_its_first_member() {
             ControlFlow::Continue(())
         })
         .unwrap();
-    let fits = (0..=60).map(|done| (Stage::Fit, done, 60, 0));
+    let fits = (0..=60).map(|done| (Stage::Fit, done, 60, usize::from((1..=20).contains(&done))));
     let samples = (0..=9).map(|done| (Stage::Sample, done, 9, usize::from((1..=3).contains(&done))));
     let expected: Vec<_> = fits.chain(samples).collect();
     assert_eq!(told[1..1 + expected.len()], expected);

@@ -10,5 +10,6 @@ pub mod inspect;
 pub mod model;
 pub mod reconstruct;
 pub mod render;
+pub mod serve;
 pub mod train;
 pub mod weights;

@@ -77,7 +77,7 @@ pub struct Args {
 }
 
 /// Options of every command that samples.
-#[derive(clap::Args)]
+#[derive(Clone, clap::Args)]
 pub struct Sampling {
     /// Model to use instead of the shipped one: a file, or hf:owner/name[@revision] for one on the Hugging Face hub.
     /// What a revision meant when it was first used is kept in the cache.

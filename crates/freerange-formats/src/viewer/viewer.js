@@ -10,7 +10,7 @@ precision highp float;
 precision highp int;
 uniform highp sampler2D gaussians;
 uniform mat4 camera; // world to camera: x right, y down, z forward
-uniform vec2 size, focal;
+uniform vec2 size, focal, middle;
 uniform float near;
 in uint index;
 flat out vec4 color; // and opacity
@@ -25,7 +25,7 @@ void main() {
   vec3 p = (camera * vec4(a.xyz, 1.0)).xyz;
   if (!(p.z >= near) || a.w < 1.0 / 255.0) return;
   mat3 shape = mat3(b.xyz, vec3(b.w, c.xy), vec3(c.zw, d.x)); // rotation times standard deviations
-  vec2 low = -0.65 * size / focal, high = 0.65 * size / focal;
+  vec2 low = -(middle + 0.15 * size) / focal, high = (1.15 * size - middle) / focal;
   vec2 slope = clamp(p.xy / p.z, low, high);
   mat3 w = transpose(mat3(camera)); // its columns are the camera's axes
   vec3 u = (focal.x / p.z) * (w[0] - slope.x * w[2]) * shape;
@@ -37,7 +37,7 @@ void main() {
   xx += BLUR;
   yy += BLUR;
   conic = vec3(yy, -xy, xx) / det;
-  center = focal * p.xy / p.z + 0.5 * size;
+  center = focal * p.xy / p.z + middle;
   color = vec4(d.yzw, a.w);
   vec2 reach = sqrt(2.0 * log(255.0 * a.w) * vec2(xx, yy)) + 0.5; // where the opacity falls to 1/255
   vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
@@ -80,7 +80,11 @@ const unit = (a) => a.map((x) => x / Math.hypot(...a));
 class Viewer {
   // `up` is the direction that stays up; colours are an array of three in 0..1.
   constructor(canvas, { up = [0, 0, 1], background = [1, 1, 1] } = {}) {
-    Object.assign(this, { canvas, background, frames: 0, rows: new Float32Array(0) });
+    this.canvas = canvas;
+    this.background = background;
+    this.frames = this.count = 0;
+    this.rows = this.depth = new Float32Array(0);
+    this.sorted = [new Uint32Array(0), new Uint32Array(0)];
     this.up = unit(up);
     // Azimuth 0 looks along the first axis that is not up.
     const side = Math.abs(this.up[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0];
@@ -88,6 +92,8 @@ class Viewer {
     this.home = { target: [0, 0, 0], azimuth: 0, elevation: 20 * Math.PI / 180, distance: 1.6, fov: 45 };
     this.orbit = { ...this.home };
     this.near = 0.01;
+    this.camera = null;
+    this.onmove = this.ondraw = null;
     this.setUp();
     canvas.addEventListener("webglcontextlost", (e) => e.preventDefault());
     canvas.addEventListener("webglcontextrestored", () => { this.setUp(); this.setGaussians(this.rows); });
@@ -147,7 +153,10 @@ class Viewer {
         r[11], r[12], r[13],
       ], i * 16);
     }
-    Object.assign(this, { rows, count: n, depth: new Float32Array(n), sorted: [new Uint32Array(n), new Uint32Array(n)] });
+    this.rows = rows;
+    this.count = n;
+    this.depth = new Float32Array(n);
+    this.sorted = [new Uint32Array(n), new Uint32Array(n)];
     gl.bindTexture(gl.TEXTURE_2D, this.texture);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, TEXTURE_ROW * 4, height, 0, gl.RGBA, gl.FLOAT, texels);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
@@ -164,10 +173,15 @@ class Viewer {
       return [sorted[Math.floor(0.01 * (n - 1))], sorted[Math.ceil(0.99 * (n - 1))]];
     });
     const target = sides.map(([a, b]) => (a + b) / 2);
-    const radius = Math.hypot(...sides.map(([a, b]) => (b - a) / 2)) || 1;
+    this.frameSphere(target, Math.hypot(...sides.map(([a, b]) => (b - a) / 2)) || 1);
+  }
+
+  // Looks at a sphere.
+  frameSphere(target, radius) {
     this.near = Math.min(0.01, radius / 100);
     this.home = { ...this.home, target, distance: 3.2 * radius };
     this.orbit = { ...this.home };
+    this.camera = null;
     this.redraw();
   }
 
@@ -176,17 +190,47 @@ class Viewer {
     const away = add(eye, target, -1), distance = Math.hypot(...away), side = cross(this.up, this.front);
     const elevation = Math.asin(Math.max(-1, Math.min(1, dot(away, this.up) / distance)));
     this.orbit = { target, fov, distance, elevation, azimuth: Math.atan2(dot(away, side), dot(away, this.front)) };
+    this.camera = null;
     this.redraw();
+  }
+
+  // Looks through a pinhole camera until the next turn: `width`, `height`, `fx`, `fy`, `cx`, `cy` in pixels, and the 16 numbers, by columns, of
+  // `world_to_camera` (x right, y down, z forward). What it saw fills the canvas.
+  setCamera(camera) {
+    this.camera = camera;
+    this.redraw();
+  }
+
+  // Orbits on from where a given camera stood.
+  leaveCamera() {
+    if (!this.camera) return;
+    const { eye } = this.pose(), { height, fy } = this.camera;
+    this.lookAt(eye, this.home.target, 2 * Math.atan(height / 2 / fy) * 180 / Math.PI);
   }
 
   // The camera's axes in the world, and where it is.
   pose() {
+    if (this.camera) {
+      const m = this.camera.world_to_camera, row = (k) => [m[k], m[k + 4], m[k + 8]], shift = [m[12], m[13], m[14]];
+      const [right, down, forward] = [0, 1, 2].map(row);
+      return { right, down, forward, eye: [0, 1, 2].map((k) => -(right[k] * shift[0] + down[k] * shift[1] + forward[k] * shift[2])) };
+    }
     const { target, azimuth, elevation, distance } = this.orbit, side = cross(this.up, this.front);
     const flat = add(this.front.map((x) => x * Math.cos(azimuth)), side, Math.sin(azimuth));
     const away = add(flat.map((x) => x * Math.cos(elevation)), this.up, Math.sin(elevation));
     const right = add(this.front.map((x) => -x * Math.sin(azimuth)), side, Math.cos(azimuth));
     const forward = away.map((x) => -x);
     return { right, down: cross(forward, right), forward, eye: add(target, away, distance) };
+  }
+
+  // Focal lengths and principal point for a picture of `size`, in its pixels.
+  lens(size) {
+    if (this.camera) {
+      const { width, height, fx, fy, cx, cy } = this.camera, [x, y] = [size[0] / width, size[1] / height];
+      return { focal: [fx * x, fy * y], middle: [cx * x, cy * y] };
+    }
+    const focal = size[1] / 2 / Math.tan(this.orbit.fov * Math.PI / 360);
+    return { focal: [focal, focal], middle: size.map((v) => v / 2) };
   }
 
   redraw() {
@@ -202,7 +246,7 @@ class Viewer {
     if (this.canvas.width !== size[0]) this.canvas.width = size[0];
     if (this.canvas.height !== size[1]) this.canvas.height = size[1];
     const { right, down, forward, eye } = this.pose(), axes = [right, down, forward];
-    const focal = size[1] / 2 / Math.tan(this.orbit.fov * Math.PI / 360);
+    const { focal, middle } = this.lens(size);
     this.sort(forward, eye);
 
     gl.viewport(0, 0, ...size);
@@ -216,13 +260,14 @@ class Viewer {
     gl.uniformMatrix4fv(at("camera"), false, [0, 1, 2].flatMap((k) => [...axes.map((a) => a[k]), 0])
       .concat(axes.map((a) => -dot(a, eye)), 1));
     gl.uniform2f(at("size"), ...size);
-    gl.uniform2f(at("focal"), focal, focal);
+    gl.uniform2f(at("focal"), ...focal);
+    gl.uniform2f(at("middle"), ...middle);
     gl.uniform1f(at("near"), this.near);
     gl.bindTexture(gl.TEXTURE_2D, this.texture);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(this.instances);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count ?? 0);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
     gl.disable(gl.BLEND);
     if (this.half) {
       gl.bindFramebuffer(gl.FRAMEBUFFER, null);
@@ -234,6 +279,7 @@ class Viewer {
     }
     this.frames += 1;
     this.canvas.dataset.frames = this.frames;
+    this.ondraw?.(this);
   }
 
   bindSum(size) {
@@ -250,7 +296,7 @@ class Viewer {
 
   // From far to near; of equals the last first. Bits of positive floats are ordered as they are: three passes of 11 bits.
   sort(forward, eye) {
-    const n = this.count ?? 0;
+    const n = this.count;
     if (n === 0) return;
     const bits = new Uint32Array(this.depth.buffer), offset = dot(forward, eye);
     for (let i = 0; i < n; i++) {
@@ -270,27 +316,37 @@ class Viewer {
   }
 
   turn(azimuth, elevation) {
+    this.leaveCamera();
     const o = this.orbit, limit = 89.5 * Math.PI / 180;
     o.azimuth += azimuth;
     o.elevation = Math.max(-limit, Math.min(limit, o.elevation + elevation));
-    this.redraw();
+    this.moved();
   }
 
   zoom(factor) {
+    this.leaveCamera();
     this.orbit.distance = Math.max(2 * this.near, Math.min(1e3 * this.home.distance, this.orbit.distance * factor));
-    this.redraw();
+    this.moved();
   }
 
   // In fractions of the picture's height.
   move(x, y) {
+    this.leaveCamera();
     const { right, down } = this.pose(), o = this.orbit, height = 2 * o.distance * Math.tan(o.fov * Math.PI / 360);
     o.target = add(add(o.target, right, -x * height), down, -y * height);
-    this.redraw();
+    this.moved();
   }
 
   reset() {
     this.orbit = { ...this.home };
+    this.camera = null;
+    this.moved();
+  }
+
+  // Whoever looked elsewhere was a person: `onmove` hears of it.
+  moved() {
     this.redraw();
+    this.onmove?.(this);
   }
 
   // What buttons and keys do.
@@ -350,12 +406,12 @@ function start(data) {
     const bytes = Uint8Array.from(atob(data.textContent.trim()), (c) => c.charCodeAt(0));
     const back = () => getComputedStyle(root).getPropertyValue("--back").trim().match(/[0-9a-f]{2}/gi).map((h) => parseInt(h, 16) / 255);
     const viewer = new Viewer(document.getElementById("view"), { up: data.dataset.up.split(" ").map(Number), background: back() });
-    window.viewer = viewer;
+    Object.assign(window, { viewer });
     const repaint = () => { viewer.background = back(); viewer.redraw(); };
     const dark = window.matchMedia("(prefers-color-scheme: dark)");
     dark.addEventListener("change", repaint);
     document.getElementById("tools").addEventListener("click", (e) => {
-      const name = e.target.dataset.do;
+      const name = e.target instanceof HTMLElement ? e.target.dataset.do : undefined;
       if (name === "background") {
         root.dataset.theme = (root.dataset.theme ?? (dark.matches ? "dark" : "light")) === "dark" ? "light" : "dark";
         repaint();

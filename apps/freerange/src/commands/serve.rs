@@ -1,0 +1,256 @@
+//! `freerange serve`
+
+use std::{net::IpAddr, ops::ControlFlow, path::PathBuf, process::Command, sync::Arc, time::Duration};
+
+use freerange::{Camera, Cloud, Reconstructor, Stage, View, choose_views, pictures::render_view};
+use freerange_camera::image_ops::to_picture;
+use freerange_serve::{
+    Engine, EngineError, Example, JobOptions, Limits, Outcome, Scene, ServeConfig, ServeError, Server, Start, Step,
+};
+use glam::DVec3;
+use image::RgbaImage;
+
+use crate::{
+    commands::reconstruct::{Sampling, StartName},
+    error::CliError,
+};
+
+/// Serve a page: drop photos with cameras, mend masks, and watch the Gaussians appear.
+///
+/// Listens on this machine only and loads nothing from elsewhere. Options of sampling are the defaults of its jobs. Ctrl-C ends it.
+#[derive(clap::Args)]
+pub struct Args {
+    /// Open the page in the browser.
+    #[arg(long)]
+    open: bool,
+    /// Port to listen at; 0 takes a free one.
+    #[arg(long, default_value_t = 7878)]
+    port: u16,
+    /// Address to listen at; beyond this machine (0.0.0.0) it needs --token.
+    #[arg(long, default_value = "127.0.0.1", value_name = "ADDRESS")]
+    host: IpAddr,
+    /// What clients have to know: 16 letters, digits or - . _ ~, or more. Browsers: http://ADDRESS/?token=TOKEN; programs: the header
+    /// `Authorization: Bearer TOKEN`.
+    #[arg(long)]
+    token: Option<String>,
+    /// A name, beside addresses, under which browsers reach the page; may be repeated.
+    #[arg(long, value_name = "HOST")]
+    name: Vec<String>,
+    /// Keep jobs in this folder: they outlive the server [default: a temporary folder, taken away at the end].
+    #[arg(long, value_name = "FOLDER")]
+    keep: Option<PathBuf>,
+    /// Longest time that a job may compute, in seconds.
+    #[arg(long, value_name = "SECONDS", default_value_t = 900, value_parser = clap::value_parser!(u64).range(1..=604_800))]
+    max_time: u64,
+    /// Most megabytes of files per job.
+    #[arg(long, value_name = "MB", default_value_t = 512, value_parser = clap::value_parser!(u64).range(1..=65_536))]
+    max_upload: u64,
+    /// Most megapixels per photo.
+    #[arg(long, value_name = "MP", default_value_t = 50, value_parser = clap::value_parser!(u64).range(1..=268))]
+    max_pixels: u64,
+    /// Most jobs that are looked at, wait or compute.
+    #[arg(long, value_name = "JOBS", default_value_t = 32, value_parser = clap::value_parser!(u16).range(1..=10_000))]
+    max_jobs: u16,
+    #[command(flatten)]
+    sampling: Sampling,
+}
+
+macro_rules! bowl {
+    ($($name:literal),*) => { &[$(($name, include_bytes!(concat!("../../../../examples/bowl/", $name)))),*] };
+}
+
+/// Part of the program, for those who have no photos at hand.
+const EXAMPLE: Example = Example {
+    name: "bowl",
+    files: bowl!["transforms_train.json", "train/000.png", "train/001.png", "train/002.png", "train/003.png"],
+};
+
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), CliError> {
+    let config = ServeConfig {
+        host: args.host,
+        port: args.port,
+        token: args.token.clone(),
+        names: args.name.clone(),
+        keep: args.keep.clone(),
+        example: Some(EXAMPLE),
+        limits: Limits {
+            job_time: Duration::from_secs(args.max_time),
+            bytes: args.max_upload << 20,
+            file_bytes: Limits::default().file_bytes.min(args.max_upload << 20),
+            pixels: args.max_pixels * 1_000_000,
+            open_jobs: args.max_jobs.into(),
+            ..Limits::default()
+        },
+    };
+    config.check()?;
+    // Before there are other threads, which take over what is set here.
+    let signals = Signals::take();
+    let device = args.sampling.device.open()?;
+    let model = args.sampling.open(&device)?;
+    args.sampling.options(&model, 1)?;
+    let place = match &args.sampling.checkpoint {
+        Some(path) => path.display().to_string(),
+        None => "the shipped model".into(),
+    };
+    let engine = Local { model, sampling: args.sampling.clone(), name: format!("{place} on {}", args.sampling.device) };
+    let server = Server::bind(&config, Arc::new(engine))?;
+    signals.end(&server)?;
+    let url = match &args.token {
+        Some(token) => format!("{}?token={token}", server.url()),
+        None => server.url(),
+    };
+    println!("{url}");
+    if args.open {
+        open(&url);
+    }
+    server.run().map_err(CliError::failure)
+}
+
+/// Hands the address to the system's browser.
+fn open(url: &str) {
+    let (program, first): (&str, &[&str]) = match std::env::consts::OS {
+        "macos" => ("open", &[]),
+        "windows" => ("cmd", &["/C", "start", ""]),
+        _ => ("xdg-open", &[]),
+    };
+    if let Err(e) = Command::new(program).args(first).arg(url).spawn() {
+        eprintln!("note: --open: {program}: {e}; open the address above");
+    }
+}
+
+/// Ctrl-C and the system's request to end.
+struct Signals;
+
+#[cfg(unix)]
+impl Signals {
+    fn set() -> libc::sigset_t {
+        // SAFETY: both calls initialise or change this set alone.
+        unsafe {
+            let mut set = std::mem::zeroed();
+            libc::sigemptyset(&mut set);
+            libc::sigaddset(&mut set, libc::SIGINT);
+            libc::sigaddset(&mut set, libc::SIGTERM);
+            set
+        }
+    }
+
+    /// Keeps them for the thread that waits for them. A connection that a client has closed must not end the program.
+    fn take() -> Self {
+        // SAFETY: no other thread is there yet; the set is initialised, and ignoring runs no code of ours.
+        unsafe {
+            libc::pthread_sigmask(libc::SIG_BLOCK, &Self::set(), std::ptr::null_mut());
+            libc::signal(libc::SIGPIPE, libc::SIG_IGN);
+        }
+        Self
+    }
+
+    /// The first ends the server in order, the second at once.
+    fn end(self, server: &Server) -> Result<(), CliError> {
+        let stopper = server.stopper();
+        let wait = || {
+            let mut signal = 0;
+            // SAFETY: both places are ours and initialised.
+            unsafe { libc::sigwait(&Self::set(), &mut signal) };
+            signal
+        };
+        let waits = move || {
+            wait();
+            stopper.stop();
+            std::process::exit(128 + wait());
+        };
+        std::thread::Builder::new().name("signals".into()).spawn(waits).map(drop).map_err(CliError::failure)
+    }
+}
+
+#[cfg(not(unix))]
+impl Signals {
+    fn take() -> Self {
+        Self
+    }
+
+    fn end(self, _: &Server) -> Result<(), CliError> {
+        Ok(())
+    }
+}
+
+impl From<ServeError> for CliError {
+    fn from(e: ServeError) -> Self {
+        match e {
+            ServeError::Folder { path, source } => Self::file(&path, source),
+            e => Self::input(e),
+        }
+    }
+}
+
+/// A model in this process.
+struct Local {
+    model: Reconstructor,
+    sampling: Sampling,
+    name: String,
+}
+
+fn engine_error(e: freerange::Error) -> EngineError {
+    if matches!(e, freerange::Error::Cancelled) {
+        return EngineError::Cancelled;
+    }
+    told(e.into())
+}
+
+fn told(e: CliError) -> EngineError {
+    match e.exit_code() {
+        2 => EngineError::Input(e.to_string()),
+        _ => EngineError::Failed(e.to_string()),
+    }
+}
+
+impl Engine for Local {
+    fn name(&self) -> String {
+        self.name.clone()
+    }
+
+    fn choose(&self, views: &[View]) -> Result<Vec<usize>, String> {
+        choose_views(views, self.model.views()).map_err(|e| e.to_string())
+    }
+
+    fn run(
+        &self,
+        scene: &Scene,
+        wanted: &JobOptions,
+        tell: &mut dyn FnMut(&Step<'_>) -> ControlFlow<()>,
+    ) -> Result<Outcome, EngineError> {
+        let mut sampling = self.sampling.clone();
+        sampling.refine = wanted.refine.or(sampling.refine);
+        sampling.steps = wanted.steps.or(sampling.steps);
+        sampling.start = match wanted.start {
+            None => sampling.start,
+            Some(Start::Fit) => Some(StartName::Fit),
+            Some(Start::Noise) => Some(StartName::Noise),
+        };
+        sampling.seed = wanted.seed.unwrap_or(sampling.seed);
+        let mut options = sampling.options(&self.model, wanted.samples.unwrap_or(1)).map_err(told)?;
+        options.frame = scene.frame;
+        let run = self.model.run(&scene.views, &options, &mut |p| {
+            let estimate = || {
+                let clouds = p.estimate().map_err(|e| e.to_string())?.unwrap_or_default();
+                let first = if p.stage == Stage::Refine { p.sample } else { 0 };
+                Ok((first..).zip(clouds).collect())
+            };
+            let (stage, sample, done, total, loss) = (p.stage.name(), p.sample, p.done, p.total, p.loss);
+            tell(&Step { stage, sample, done, total, loss, estimate: &estimate })
+        });
+        let result = run.map_err(engine_error)?;
+        Ok(Outcome {
+            samples: result.samples.into_iter().map(|s| (s.seed, s.gaussians)).collect(),
+            // The canonical frame has +z up.
+            up: (result.canonical_from_user.rotation.inverse() * DVec3::Z).to_array(),
+            notes: result.notes,
+            seconds: result.seconds.iter().map(|(stage, s)| (stage.name().to_owned(), *s)).collect(),
+        })
+    }
+
+    fn picture(&self, cloud: &Cloud, camera: &Camera) -> Result<RgbaImage, String> {
+        let rgb = render_view(cloud, camera).map_err(|e| e.to_string())?;
+        Ok(to_picture(&rgb, camera.width, camera.height))
+    }
+}

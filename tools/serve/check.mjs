@@ -1,0 +1,270 @@
+#!/usr/bin/env node
+// The page of `freerange serve` in headless Chromium, from a dropped folder to a downloaded .glb in another program's reader.
+//
+//     node --experimental-websocket check.mjs ../../target/release/freerange
+//
+// Needs Chromium ($CHROMIUM, or `chromium` on the path). With $PICTURES, pictures of every state are written there.
+import { execFileSync, spawn } from "node:child_process";
+import { mkdirSync, mkdtempSync, readFileSync, rmSync, writeFileSync } from "node:fs";
+import { tmpdir } from "node:os";
+import { join, resolve } from "node:path";
+import { browser, serve } from "../formats/browser.mjs";
+
+const [, , command] = process.argv;
+const here = new URL(".", import.meta.url).pathname, root = resolve(here, "../.."), bowl = join(root, "examples/bowl");
+const folder = mkdtempSync(join(tmpdir(), "serve-")), keep = join(folder, "keep"), pictures = process.env.PICTURES;
+if (pictures) mkdirSync(pictures, { recursive: true });
+let failed = 0;
+const check = (name, ok, found) => {
+  console.log(`${ok ? "ok    " : "FAILED"} ${name}: ${found}`);
+  failed += ok ? 0 : 1;
+};
+const told = (name, found) => console.log(`        ${name}: ${found}`);
+const wait = (ms) => new Promise((done) => setTimeout(done, ms));
+
+/** Starts the program; resolves when it has told its address. */
+const start = () => new Promise((done, fail) => {
+  const program = spawn(command, ["serve", "--port", "0", "--keep", keep, "--device", "cpu"], { stdio: ["ignore", "pipe", "inherit"] });
+  let text = "";
+  program.on("error", fail);
+  program.on("exit", (code, signal) => fail(new Error(`freerange serve ended: ${code ?? signal}`)));
+  program.stdout.on("data", (chunk) => {
+    text += chunk;
+    const found = /^(http:\/\/\S+)\/\n/.exec(text);
+    if (found) done({ program, url: found[1] });
+  });
+});
+const ended = (program) => new Promise((done) => {
+  program.removeAllListeners("exit");
+  program.once("exit", (code, signal) => done(code ?? signal));
+});
+
+let { program, url } = await start();
+const get = async (path) => {
+  const response = await fetch(url + path);
+  if (!response.ok) throw new Error(`${path}: ${response.status}`);
+  return Buffer.from(await response.arrayBuffer());
+};
+const chromium = await browser(1100, 850);
+const { send, evaluate, until } = chromium;
+const click = (selector) => evaluate(`document.querySelector(${JSON.stringify(selector)}).click()`);
+const state = (name, seconds = 300) => until(`document.body.dataset.state === ${JSON.stringify(name)}`, seconds);
+const picture = async (name) => {
+  if (!pictures) return;
+  await evaluate("window.viewers?.forEach((v) => v.draw())");
+  const { data } = await send("Page.captureScreenshot", { format: "jpeg", quality: 50 });
+  writeFileSync(join(pictures, `${name}.jpg`), Buffer.from(data, "base64"));
+};
+const mouse = (type, x, y, buttons = 1) => send("Input.dispatchMouseEvent", { type, x, y, button: "left", buttons: type === "mouseReleased" ? 0 : buttons, clickCount: 1 });
+const middle = (selector) => evaluate(`(() => { const r = document.querySelector(${JSON.stringify(selector)}).getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2]; })()`);
+const drag = async (selector, dx, dy) => {
+  const [x, y] = await middle(selector);
+  await mouse("mousePressed", x, y);
+  for (const t of [0.25, 0.5, 0.75, 1]) await mouse("mouseMoved", x + t * dx, y + t * dy);
+  await mouse("mouseReleased", x + dx, y + dy);
+};
+const key = async (name, code) => {
+  await send("Input.dispatchKeyEvent", { type: "keyDown", key: name, code: name, windowsVirtualKeyCode: code });
+  await send("Input.dispatchKeyEvent", { type: "keyUp", key: name, code: name, windowsVirtualKeyCode: code });
+};
+const axe = readFileSync(join(here, "node_modules/axe-core/axe.min.js"), "utf8");
+const accessible = async (what) => {
+  await send("Runtime.evaluate", { expression: axe });
+  const found = await evaluate("axe.run(document, { resultTypes: ['violations'] }).then((r) => r.violations.filter((v) => ['serious', 'critical'].includes(v.impact)).map((v) => v.id + ': ' + v.nodes.map((n) => n.target.join(' ')).slice(0, 3).join(', ')))");
+  check(`axe, ${what}`, found.length === 0, found.join("; ") || "nothing serious");
+};
+/** A number that differs where Gaussians differ. */
+const SUM = "window.viewers[0].rows.reduce((sum, v, i) => sum + v * ((i % 97) + 1), 0)";
+
+try {
+  await send("Emulation.setEmulatedMedia", { features: [{ name: "prefers-color-scheme", value: "light" }] });
+  let bytes = 0;
+  for (const path of ["/", "/style.css", "/viewer.js", "/page.js"]) bytes += (await get(path)).length;
+  check("size of the page", bytes < 100_000, `${bytes} bytes`);
+  await chromium.open(url);
+  await until("document.getElementById('engine').textContent");
+  await accessible("at the start");
+  await picture("start");
+
+  // A folder is dropped.
+  const [x, y] = await middle("#drop");
+  const data = { items: [], files: [bowl], dragOperationsMask: 1 };
+  for (const type of ["dragEnter", "dragOver", "drop"]) await send("Input.dispatchDragEvent", { type, x, y, data });
+  await state("ready", 120);
+  await until("document.querySelectorAll('#photos img.cut').length === 4 && [...document.querySelectorAll('#photos img')].every((i) => i.complete)");
+  const title = await evaluate("document.getElementById('job-title').textContent");
+  check("a dropped folder", title === "bowl", title);
+  await accessible("with photos");
+  await picture("understood");
+
+  // A mask is mended: by pointer, by keys.
+  await click("#photos li:nth-child(2) button:not(.look)");
+  await until("document.getElementById('brush').open");
+  await wait(200);
+  await click("#paint-erase");
+  await drag("#paint", 40, 10);
+  await evaluate("document.getElementById('paint').focus()");
+  await key("ArrowRight", 39);
+  await send("Input.dispatchKeyEvent", { type: "keyDown", key: " ", code: "Space", windowsVirtualKeyCode: 32 });
+  await picture("brush");
+  await accessible("brush");
+  await click("#paint-undo");
+  await click("#paint-undo");
+  await click("#paint-add");
+  await drag("#paint", 12, 6);
+  await click("#paint-save");
+  await until("document.querySelector('#photos li:nth-child(2)').textContent.includes('mended')");
+  check("a mended mask", true, await evaluate("document.querySelector('#photos li:nth-child(2) .small').textContent"));
+
+  // Go; orbit while it computes; cancel.
+  const go = async () => {
+    await evaluate("document.body.dataset.estimates = '0'; window.pressed = performance.now(); document.getElementById('go').click()");
+    await until("Number(document.body.dataset.estimates) > 0 && window.viewers[0].count > 0", 120);
+    return evaluate("performance.now() - window.pressed");
+  };
+  const first = await go();
+  told("first estimate on the page after pressing go", `${(first / 1000).toFixed(2)} s at most (looked at 20 times a second)`);
+  const orbit = "JSON.stringify(window.viewers[0].orbit)", before = await evaluate(orbit);
+  await drag(".stage canvas", 80, 30);
+  const running = await evaluate("document.body.dataset.state");
+  check("orbit while it computes", running === "running" && before !== await evaluate(orbit), running);
+  const pressed = Date.now();
+  await click("#cancel");
+  await state("cancelled", 10);
+  check("cancel", true, `${Date.now() - pressed} ms`);
+
+  // Another one to the end.
+  await go();
+  const seen = new Set();
+  let shot = false;
+  while (await evaluate("document.body.dataset.state !== 'done' && document.body.dataset.state !== 'failed'")) {
+    seen.add(`${await evaluate("document.body.dataset.state === 'running' ? document.getElementById('status').textContent.split(':')[0] : ''")} ${await evaluate(SUM)}`);
+    if (!shot && seen.size > 6) {
+      await picture("running");
+      shot = true;
+    }
+    await wait(30);
+  }
+  const stages = [...new Set([...seen].map((s) => s.slice(0, s.lastIndexOf(" "))))].filter(Boolean);
+  check("different estimates", seen.size >= 5, `${seen.size}, in ${stages.join(", ")}`);
+  await state("done", 1);
+  const id = await evaluate("location.hash.slice(5)");
+  await until(`document.body.dataset.result === ${JSON.stringify(id)}`);
+  await picture("done");
+  await accessible("with a result");
+
+  // Through a photo's camera, and the slider between the two.
+  await click("#photos li:nth-child(1) .look");
+  await until("!document.getElementById('compare').hidden && document.querySelector('.stage img').complete");
+  await evaluate("document.getElementById('slider').focus()");
+  const clip = "document.querySelector('.stage img').style.clipPath", at50 = await evaluate(clip);
+  for (let i = 0; i < 10; i++) await key("ArrowRight", 39);
+  check("slider by keys", at50 !== await evaluate(clip), `${at50} to ${await evaluate(clip)}`);
+  await evaluate("document.getElementById('slider').value = 50; document.getElementById('slider').dispatchEvent(new Event('input'))");
+  await evaluate("window.scrollTo(0, 0)");
+  await picture("slider");
+
+  // The page's pixels beside those of `freerange render`, from the same camera.
+  const ply = join(folder, "gaussians.ply");
+  writeFileSync(ply, await get(`/jobs/${id}/samples/0.ply`));
+  execFileSync(command, ["render", ply, "--cameras", join(bowl, "transforms_train.json"), "-o", join(folder, "renders")]);
+  await evaluate("Object.assign(document.querySelector('.stage').style, { width: '514px', height: '514px', aspectRatio: 'auto', boxSizing: 'border-box' })");
+  await until("window.viewers[0].canvas.clientWidth === 512 && window.viewers[0].canvas.clientHeight === 512");
+  const shown = await evaluate("(window.viewers[0].draw(), window.viewers[0].canvas.toDataURL())");
+  writeFileSync(join(folder, "page.png"), Buffer.from(shown.split(",")[1], "base64"));
+  const glb = await get(`/jobs/${id}/samples/0.glb`);
+  writeFileSync(join(folder, "object.glb"), glb);
+  const job = JSON.parse(await get(`/jobs/${id}`));
+
+  // Frames per second.
+  const frames = await evaluate(`(async () => {
+    const viewer = window.viewers[0], n = 8192, rows = new Float32Array(14 * n), from = viewer.rows;
+    for (let i = 0; i < n; i++) rows.set(from.subarray(14 * (i % (from.length / 14)), 14 * (i % (from.length / 14)) + 14), 14 * i);
+    viewer.setGaussians(rows);
+    viewer.leaveCamera();
+    const pixel = new Uint8Array(4), begin = performance.now();
+    let frames = 0;
+    while (performance.now() - begin < 3000) {
+      viewer.turn(0.02, 0);
+      viewer.draw();
+      viewer.gl.readPixels(0, 0, 1, 1, viewer.gl.RGBA, viewer.gl.UNSIGNED_BYTE, pixel);
+      frames += 1;
+    }
+    viewer.setGaussians(from);
+    return 1000 * frames / (performance.now() - begin);
+  })()`);
+  told("frames per second, 8,192 Gaussians, 512 x 512", frames.toFixed(1));
+
+  // A reload finds the job again.
+  await chromium.open(`${url}/#job=${id}`);
+  await until(`document.body.dataset.result === ${JSON.stringify(id)}`);
+  check("reload", true, await evaluate("document.getElementById('status').textContent"));
+
+  // Several samples, and where they differ.
+  await evaluate("Object.assign(document.getElementById('samples'), { value: 2 }); Object.assign(document.getElementById('refine'), { value: 60 }); document.getElementById('start-at').value = 'noise'");
+  await go();
+  await state("done", 600);
+  await until("Number(document.getElementById('heat').dataset.mean) > 0", 30);
+  check("where samples differ", await evaluate("window.viewers.length === 2"), await evaluate("document.getElementById('spread-text').textContent"));
+  await evaluate("document.getElementById('job-title').scrollIntoView()");
+  await picture("samples");
+
+  // A phone, in the dark.
+  await send("Emulation.setDeviceMetricsOverride", { width: 390, height: 844, deviceScaleFactor: 1, mobile: true });
+  await send("Emulation.setEmulatedMedia", { features: [{ name: "prefers-color-scheme", value: "dark" }] });
+  await wait(300);
+  const wide = await evaluate("document.documentElement.scrollWidth");
+  check("a phone's width", wide <= 390, `${wide} px of 390`);
+  await accessible("on a phone, dark");
+  await picture("phone");
+  await send("Emulation.setDeviceMetricsOverride", { width: 1100, height: 850, deviceScaleFactor: 1, mobile: false });
+  const errors = chromium.errors.filter((e) => !/status of 4(04|10)/.test(e));
+  check("errors of the page", errors.length === 0, errors.join("; ") || "none");
+
+  // Killed in the middle of a job, and started again.
+  await evaluate("document.getElementById('start-at').value = ''");
+  await go();
+  const gone = ended(program);
+  program.kill("SIGKILL");
+  await gone;
+  ({ program, url } = await start());
+  await chromium.open(`${url}/#job=${id}`);
+  await state("interrupted", 30);
+  check("kill -9 and start again", true, await evaluate("document.getElementById('status').textContent"));
+  await picture("interrupted");
+  const left = ended(program);
+  program.kill("SIGTERM");
+  check("asked to end", await Promise.race([left, wait(20_000).then(() => "still there")]) === 0, "exit code 0");
+
+  // The .glb in three.js; and the pictures, decoded without anyone's colour management.
+  const files = await serve({ modules: join(here, "../formats/node_modules"), files: folder, page: join(here, "../formats") });
+  try {
+    await chromium.open(`${files.url}/page/readers.html`);
+    await until("window.ready");
+    const decode = async (name) => Buffer.from((await evaluate(`decode("/files/${name}")`)).data, "base64");
+    const psnr = (a, b) => {
+      let sum = 0, n = 0;
+      a.forEach((v, i) => { if (i % 4 < 3) { sum += (v - b[i]) ** 2; n += 1; } });
+      return 10 * Math.log10(255 ** 2 * n / sum);
+    };
+    const ours = await decode("renders/000.png"), db = psnr(ours, await decode("page.png"));
+    check("the page beside freerange render", db >= 30, `${db.toFixed(1)} dB`);
+    // The first photo's camera as three.js wants it; files of glTF have +y up.
+    const { camera } = job.understood.views[0], m = camera.world_to_camera, rows = [0, 1, 2].map((i) => [m[i], m[i + 4], m[i + 8]]);
+    const eye = [0, 1, 2].map((k) => -(rows[0][k] * m[12] + rows[1][k] * m[13] + rows[2][k] * m[14]));
+    const toYUp = ([a, b, c]) => [a, c, -b], target = eye.map((v, k) => v + rows[2][k]);
+    const fov = 2 * Math.atan(camera.height / 2 / camera.fy) * 180 / Math.PI;
+    const view = { url: "/files/object.glb", width: 512, height: 512, fov, eye: toYUp(eye), target: toYUp(target), up: toYUp(rows[1].map((v) => -v)) };
+    const { data: pixels } = await evaluate(`three(${JSON.stringify(view)})`);
+    const other = psnr(ours, Buffer.from(pixels, "base64"));
+    check("the .glb in three.js beside freerange render", other >= 25, `${other.toFixed(1)} dB, ${glb.length} bytes`);
+  } finally {
+    files.close();
+  }
+} finally {
+  await chromium.close();
+  program.kill("SIGKILL");
+}
+console.log(failed ? `${failed} checks failed; files are in ${folder}` : "all is well");
+if (!failed) rmSync(folder, { recursive: true, force: true });
+process.exit(failed ? 1 : 0);

@@ -1,0 +1,23 @@
+import js from "@eslint/js";
+
+const names = (text) => Object.fromEntries(text.split(" ").map((name) => [name, "readonly"]));
+
+export default [
+  { ...js.configs.recommended, files: ["**/*.js", "**/*.mjs"] },
+  {
+    files: ["**/*.js"],
+    languageOptions: {
+      sourceType: "script",
+      globals: names("window document location fetch EventSource FormData File OffscreenCanvas HTMLElement "
+        + "HTMLButtonElement HTMLInputElement HTMLSelectElement HTMLProgressElement HTMLCanvasElement HTMLFormElement HTMLAnchorElement HTMLDialogElement "
+        + "createImageBitmap setTimeout clearTimeout requestAnimationFrame cancelAnimationFrame ResizeObserver getComputedStyle URLSearchParams atob Viewer"),
+    },
+    rules: { eqeqeq: "error", "no-implicit-globals": "off", "no-var": "error", "prefer-const": "error", "no-eval": "error", "no-unused-vars": ["error", { varsIgnorePattern: "^Viewer$" }] },
+  },
+  { files: ["**/*.mjs"], languageOptions: { globals: names("process URL console setTimeout fetch Buffer") } },
+  {
+    // The viewer defines what the page uses.
+    files: ["**/viewer.js"],
+    rules: { "no-redeclare": "off" },
+  },
+];

@@ -1,0 +1,35 @@
+#!/usr/bin/env bash
+# The page of `freerange serve`: types and lint of its JavaScript, then check.mjs, which drives the real program in headless Chromium. Says what it leaves
+# out where Node 20, Chromium or packages from npm cannot be had. PICTURES=FOLDER also writes pictures of every state.
+#
+#     tools/serve/run.sh target/release/freerange
+set -euo pipefail
+binary=$(realpath "$1")
+cd "$(dirname "$0")"
+leave() {
+  echo "LEFT OUT: the page in a browser: $*"
+  exit 0
+}
+node -e 'process.exit(Number(process.versions.node.split(".")[0]) >= 20 ? 0 : 1)' 2>/dev/null || leave "no Node of version 20 or later"
+if [ -z "${CHROMIUM:-}" ]; then
+  CHROMIUM=$(command -v chromium || command -v chromium-browser || command -v google-chrome || true)
+  if [ -z "$CHROMIUM" ]; then
+    { apt-get update -q && apt-get install -q -y --no-install-recommends chromium; } || leave "no Chromium"
+    CHROMIUM=chromium
+  fi
+fi
+export CHROMIUM
+# Other people's readers of .glb are those of the formats' check.
+for folder in . ../formats; do
+  [ -d "$folder/node_modules" ] || (cd "$folder" && npm ci --no-audit --no-fund --ignore-scripts) || leave "no packages from npm"
+done
+npx tsc -p tsconfig.json
+npx tsc -p tsconfig.viewer.json
+# ESLint does not look above its own folder.
+trap 'rm -rf linted' EXIT
+mkdir -p linted
+cp ../../crates/freerange-serve/src/page/page.js ../../crates/freerange-formats/src/viewer/viewer.js linted/
+npx eslint linted check.mjs
+options=()
+node -e 'process.exit(typeof WebSocket === "undefined" ? 1 : 0)' || options+=(--experimental-websocket)
+node "${options[@]}" check.mjs "$binary"
