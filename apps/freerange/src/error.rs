@@ -157,10 +157,12 @@ other_errors!(
 
 #[cfg(test)]
 mod tests {
+    use freerange_core::IoError;
+
     use super::*;
 
     fn data(kind: io::ErrorKind) -> DataError {
-        DataError::Io { path: "shards/a.tar".into(), source: kind.into() }
+        DataError::Io(IoError { path: "shards/a.tar".into(), source: kind.into() })
     }
 
     #[test]

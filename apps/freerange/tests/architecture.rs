@@ -4,6 +4,7 @@ use std::{collections::BTreeMap, fs, path::Path};
 
 /// Each crate, and which of the others it may use. They stand in the road's order: nobody uses what comes later.
 const ROOMS: &[(&str, &[&str])] = &[
+    ("freerange-core", &[]),
     ("freerange-splat", &[]),
     ("freerange-camera", &[]),
     ("freerange-scene", &["freerange-camera"]),
@@ -12,16 +13,21 @@ const ROOMS: &[(&str, &[&str])] = &[
     ("freerange-raster", &["freerange-camera"]),
     ("freerange-model", &["freerange-splat"]),
     ("freerange-metrics", &["freerange-model"]),
-    ("freerange-mesh", &["freerange-camera"]),
+    ("freerange-mesh", &["freerange-core"]),
+    ("freerange-render", &["freerange-core", "freerange-camera", "freerange-mesh"]),
+    ("freerange-generate", &["freerange-core", "freerange-mesh"]),
     ("freerange-fit", &["freerange-splat", "freerange-camera", "freerange-raster", "freerange-metrics"]),
     (
         "freerange-data",
         &[
+            "freerange-core",
             "freerange-splat",
             "freerange-camera",
             "freerange-raster",
             "freerange-metrics",
             "freerange-mesh",
+            "freerange-render",
+            "freerange-generate",
             "freerange-fit",
         ],
     ),

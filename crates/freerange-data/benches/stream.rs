@@ -10,7 +10,7 @@ use freerange_data::{
     BuildConfig, BuildOptions, ImageFormat, Items, ObjectConfig, ObjectSource, ShardConfig, Shards, Store, Stream,
     build,
 };
-use freerange_mesh::CameraConfig;
+use freerange_render::CameraConfig;
 
 #[path = "../../../tools/machine.rs"]
 mod machine;

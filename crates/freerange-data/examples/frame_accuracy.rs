@@ -45,7 +45,7 @@ fn main() -> Result<(), Failure> {
 }
 
 fn object(seed: u64, config: &ObjectConfig) -> Result<[Errors; 2], Failure> {
-    let mesh = freerange_mesh::generate(seed, &config.generator)?;
+    let mesh = freerange_generate::generate(seed, &config.generator)?;
     let object = Object::generate(seed, config, &[4])?;
     let centers: Vec<DVec3> = object.views.iter().map(|v| v.camera.center()).collect();
     let sets = select_views(&centers, DVec3::ZERO, &SelectionConfig::default())?;

@@ -7,13 +7,14 @@ use std::collections::{BTreeMap, VecDeque};
 use std::io::Write;
 use std::panic::AssertUnwindSafe;
 use std::path::Path;
-use std::str::FromStr;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
 use freerange_camera::{SelectionConfig, View, ViewSets, select_views};
-use freerange_mesh::{Mesh, generate, load_mesh};
+use freerange_core::{Invalid, IoError, Share, sha256};
+use freerange_generate::generate;
+use freerange_mesh::{Mesh, load_mesh};
 use freerange_splat::Statistics;
 use glam::DVec3;
 
@@ -22,39 +23,11 @@ use crate::manifest::{FORMAT, Failure, Manifest, ObjectRecord, Plan, ShardRecord
 use crate::object::{Made, Photographed, Seconds, lap, make};
 use crate::sample::Metadata;
 use crate::shard::{END, ObjectBytes, object_bytes};
-use crate::store::{Store, io_error, sha256};
+use crate::store::Store;
 use crate::{BuildConfig, DataError, HeldOutPsnr, Object, Split};
 
 /// Largest finished object, in bytes.
 const MAX_PART: u64 = 4 << 30;
-
-/// Which of the shards a process makes: those whose number leaves the remainder `index` when divided by `count`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Share {
-    /// Number of this process, from 0.
-    pub index: u64,
-    /// Number of processes.
-    pub count: u64,
-}
-
-impl Default for Share {
-    fn default() -> Self {
-        Self { index: 0, count: 1 }
-    }
-}
-
-impl FromStr for Share {
-    type Err = String;
-
-    /// `i/n` with `i < n`, such as `$SLURM_ARRAY_TASK_ID/$SLURM_ARRAY_TASK_COUNT`.
-    fn from_str(text: &str) -> Result<Self, String> {
-        let parsed = text.split_once('/').and_then(|(i, n)| Some((i.parse().ok()?, n.parse().ok()?)));
-        match parsed {
-            Some((index, count)) if index < count => Ok(Self { index, count }),
-            _ => Err(format!("expected i/n with i from 0 to n - 1, such as 0/8, found {text:?}")),
-        }
-    }
-}
 
 /// How the work is done; none of it changes the result.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -211,7 +184,9 @@ pub fn collect(store: &Store, other: &Store) -> Result<u64, DataError> {
         }
         let name = record.name();
         let mut file = store.create(&name)?;
-        other.pieces(&name, record.bytes, |piece| file.write_all(piece).map_err(io_error(&store.path(&name))))?;
+        other.pieces(&name, record.bytes, |piece| {
+            Ok(file.write_all(piece).map_err(IoError::at(&store.path(&name)))?)
+        })?;
         let found = file.sha256();
         if found != record.sha256 {
             let problem = format!("expected SHA-256 {} as in its record, found {found}", record.sha256);
@@ -250,11 +225,7 @@ fn pools(workers: usize) -> Result<Vec<rayon::ThreadPool>, DataError> {
     (0..workers)
         .map(|_| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads((cores / workers).max(1)).build();
-            pool.map_err(|e| DataError::Config {
-                field: "workers".into(),
-                expected: "threads that the system can start".into(),
-                found: e.to_string(),
-            })
+            pool.map_err(|e| DataError::from(Invalid::new("workers", "threads that the system can start", e)))
         })
         .collect()
 }
@@ -290,7 +261,7 @@ pub(crate) fn mesh_of(item: &Item, config: &BuildConfig) -> Result<(Mesh, FileFa
         None => Ok((generate(seed_of(item, config), &config.object.generator)?, FileFacts::default())),
         Some(path) => {
             let loaded = load_mesh(path, &config.mesh)?;
-            let bytes = std::fs::read(path).map_err(io_error(path))?; // the loader has checked its size
+            let bytes = std::fs::read(path).map_err(IoError::at(path))?; // the loader has checked its size
             Ok((loaded.mesh, FileFacts { sha256: Some(sha256(&bytes)), notes: loaded.notes }))
         }
     }
@@ -488,10 +459,8 @@ where
     }
 
     fn item(&self, index: u64) -> Result<Item, DataError> {
-        self.items.get(index).ok_or_else(|| DataError::Config {
-            field: "items".into(),
-            expected: format!("item {index}"),
-            found: format!("{} items", self.items.len()),
+        self.items.get(index).ok_or_else(|| {
+            DataError::from(Invalid::new("items", format!("item {index}"), format!("{} items", self.items.len())))
         })
     }
 
@@ -605,7 +574,7 @@ where
                 Outcome::Made { split, psnr, flagged, statistics } => {
                     let part = format!("{folder}/{}", bytes_name(index));
                     let content = self.store.read(&part, MAX_PART)?.ok_or_else(|| lost(part))?;
-                    file.write_all(&content).map_err(io_error(&self.store.path(&name)))?;
+                    file.write_all(&content).map_err(IoError::at(&self.store.path(&name)))?;
                     let bytes = content.len() as u64;
                     let object = ObjectRecord { index, id, offset, bytes, licence, split, psnr, flagged };
                     offset += bytes;
@@ -617,7 +586,7 @@ where
                 }
             }
         }
-        file.write_all(&END).map_err(io_error(&self.store.path(&name)))?;
+        file.write_all(&END).map_err(IoError::at(&self.store.path(&name)))?;
         (record.bytes, record.sha256) = file.finish()?;
         self.store.write(&record_name(shard), &to_json(&record, self.store, &record_name(shard))?)?;
         self.store.remove_folder(&folder)?;
@@ -664,14 +633,6 @@ fn chain(error: &dyn std::error::Error) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn shares_are_parsed_strictly() {
-        assert_eq!("3/8".parse(), Ok(Share { index: 3, count: 8 }));
-        for text in ["", "3", "8/8", "-1/2", "0/0", "1/2/3", "a/b"] {
-            assert!(text.parse::<Share>().unwrap_err().contains("i/n"), "{text}");
-        }
-    }
 
     #[test]
     fn splits_have_their_shares_and_do_not_change_with_the_rest() {

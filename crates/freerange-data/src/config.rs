@@ -1,10 +1,10 @@
 //! What a folder of shards is told.
 
 use freerange_camera::SelectionConfig;
+use freerange_core::{Invalid, check};
 use freerange_mesh::LoadLimits;
 
 use crate::sample::MAX_DEPTH;
-use crate::validate::check;
 use crate::{DataError, ObjectConfig};
 
 /// A part of the data.
@@ -85,8 +85,8 @@ impl ShardConfig {
     /// Checks every field.
     ///
     /// # Errors
-    /// [`DataError::Config`] with the field's name.
-    pub fn validate(&self) -> Result<(), DataError> {
+    /// [`Invalid`] with the field's name.
+    pub fn validate(&self) -> Result<(), Invalid> {
         let per = self.objects_per_shard;
         check((1..=1 << 20).contains(&per), "objects_per_shard", "1 to 2^20", per)?;
         check(self.held_out <= 100, "held_out", "0 to 100", self.held_out)?;

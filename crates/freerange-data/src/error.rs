@@ -1,5 +1,7 @@
 use std::path::PathBuf;
 
+use freerange_core::{Invalid, IoError};
+
 /// What can go wrong with training data.
 #[derive(Debug, thiserror::Error)]
 pub enum DataError {
@@ -14,15 +16,8 @@ pub enum DataError {
         found: Vec<u32>,
     },
     /// A configuration field has an impossible value.
-    #[error("{field}: expected {expected}, found {found}")]
-    Config {
-        /// The field.
-        field: String,
-        /// What it may be.
-        expected: String,
-        /// What it is.
-        found: String,
-    },
+    #[error(transparent)]
+    Config(#[from] Invalid),
     /// A file or folder is not what it should be.
     #[error("{}: {problem}", path.display())]
     File {
@@ -32,13 +27,8 @@ pub enum DataError {
         problem: String,
     },
     /// Reading or writing failed.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// The reason.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    Io(#[from] IoError),
     /// A place for shards that cannot be used.
     #[error("{location}: {problem}")]
     Store {

@@ -3,8 +3,9 @@
 use crate::build::{BuildOptions, Done, build};
 use crate::items::Items;
 use crate::object::Seconds;
-use crate::store::{Store, io_error};
+use crate::store::Store;
 use crate::{BuildConfig, DataError, HeldOutPsnr};
+use freerange_core::{Invalid, IoError};
 
 /// Costs per object, measured.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
@@ -47,18 +48,18 @@ pub fn estimate(
     sample: u64,
     progress: impl Fn(Done) + Sync,
 ) -> Result<Estimate, DataError> {
-    let folder = tempfile::tempdir().map_err(io_error(&std::env::temp_dir()))?;
+    let folder = tempfile::tempdir().map_err(IoError::at(&std::env::temp_dir()))?;
     let some = items.spread(sample);
     // One core per worker, as in a large job: several cores within one object would hide their waiting.
     let workers = rayon::current_num_threads();
     let options = BuildOptions { workers, ..BuildOptions::default() };
     let summary = build(config, &some, &Store::local(folder.path()), &options, progress)?;
     if summary.made == 0 {
-        return Err(DataError::Config {
-            field: "sample".into(),
-            expected: "at least one object that can be made".into(),
-            found: summary.failures.first().map_or("none".into(), |f| format!("{}: {}", f.id, f.reason)),
-        });
+        return Err(DataError::from(Invalid::new(
+            "sample",
+            "at least one object that can be made",
+            summary.failures.first().map_or("none".into(), |f| format!("{}: {}", f.id, f.reason)),
+        )));
     }
     Ok(Estimate {
         sampled: some.len(),

@@ -77,7 +77,7 @@ mod tests {
         config.views = 12;
         config.cameras.resolution = 64;
         config.fit = FitConfig { iterations: 60, initial: 512, max_gaussians: 512, ..FitConfig::default() };
-        let mesh = freerange_mesh::generate(3, &config.generator).unwrap();
+        let mesh = freerange_generate::generate(3, &config.generator).unwrap();
         let mut shot = Photographed::new(mesh, 3, &config, 4, &mut Seconds::default()).unwrap();
         let leaves = fitted_gaussians(&mut shot, &config).unwrap();
         assert_eq!(leaves.len(), 512);

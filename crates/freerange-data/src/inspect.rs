@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use freerange_core::{Invalid, hex};
 use freerange_splat::{Cloud, Normalization, channel};
 use image::{Rgb, RgbImage, RgbaImage};
 use rayon::prelude::*;
@@ -11,7 +12,7 @@ use crate::items::{Input, count};
 use crate::manifest::{Failure, Manifest};
 use crate::quality::{over_white, render_over_white};
 use crate::shards::{check_size, read_object};
-use crate::store::{Store, hex};
+use crate::store::Store;
 use crate::{DataError, Object};
 
 /// What [`inspect`] finds in a folder.
@@ -138,10 +139,12 @@ pub fn contact_sheet(
     columns: u64,
 ) -> Result<RgbaImage, DataError> {
     let count = objects.len() as u64;
-    let refused = |found: String| DataError::Config {
-        field: "contact sheet".into(),
-        expected: format!("at least one object and column, and at most {MAX_SHEET} pixels either way"),
-        found,
+    let refused = |found: String| {
+        DataError::from(Invalid::new(
+            "contact sheet",
+            format!("at least one object and column, and at most {MAX_SHEET} pixels either way"),
+            found,
+        ))
     };
     if count == 0 || columns == 0 {
         return Err(refused(format!("{count} objects in {columns} columns")));
@@ -177,10 +180,12 @@ pub fn contact_sheet(
 /// The pictures of an object on a contact sheet, at least one.
 fn pictures(object: &Object, leaves: Option<&Cloud>) -> Result<Vec<RgbImage>, DataError> {
     let depths: Vec<u32> = object.slices.keys().copied().collect();
-    let no = |what: &str| DataError::Config {
-        field: format!("object {}", object.id),
-        expected: "at least one view and one slice".into(),
-        found: format!("no {what}"),
+    let no = |what: &str| {
+        DataError::from(Invalid::new(
+            format!("object {}", object.id),
+            "at least one view and one slice",
+            format!("no {what}"),
+        ))
     };
     let camera = object.views.first().ok_or_else(|| no("view"))?.camera;
     let (coarse, fine) = depths.first().zip(depths.last()).ok_or_else(|| no("slice"))?;

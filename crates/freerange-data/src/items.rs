@@ -4,9 +4,9 @@ use std::collections::{BTreeMap, HashSet};
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
+use freerange_core::{IoError, hex, sha256};
 use sha2::{Digest, Sha256};
 
-use crate::store::{hex, io_error, sha256};
 use crate::{DataError, Split, object::generated_id};
 
 /// Endings of mesh files that are looked for in a folder.
@@ -102,14 +102,14 @@ impl Items {
             for entry in walkdir::WalkDir::new(path).sort_by_file_name() {
                 let entry = entry.map_err(|e| {
                     let at = e.path().unwrap_or(path).to_path_buf();
-                    io_error(&at)(e.into())
+                    DataError::from(IoError::at(&at)(e.into()))
                 })?;
                 if entry.file_type().is_file() && is_mesh(entry.path()) {
                     files.push(entry.into_path());
                 }
             }
         } else {
-            std::fs::metadata(path).map_err(io_error(path))?;
+            std::fs::metadata(path).map_err(IoError::at(path))?;
             files.push(path.into());
         }
         if files.is_empty() {
@@ -135,8 +135,8 @@ impl Items {
     pub fn list(path: &Path, source: &str, licence: &str) -> Result<Self, DataError> {
         let problem = |problem: String| DataError::File { path: path.into(), problem };
         let mut text = String::new();
-        let file = std::fs::File::open(path).map_err(io_error(path))?;
-        file.take(MAX_LIST + 1).read_to_string(&mut text).map_err(io_error(path))?;
+        let file = std::fs::File::open(path).map_err(IoError::at(path))?;
+        file.take(MAX_LIST + 1).read_to_string(&mut text).map_err(IoError::at(path))?;
         if text.len() as u64 > MAX_LIST {
             return Err(problem(format!("expected at most {MAX_LIST} bytes")));
         }
@@ -303,7 +303,7 @@ mod tests {
         assert_eq!(one.get(0).unwrap().id, "b-c-mug");
         let empty = tempfile::tempdir().unwrap();
         assert!(Items::find(empty.path(), "", "").unwrap_err().to_string().contains("glb"));
-        assert!(matches!(Items::find(&root.join("none"), "", ""), Err(DataError::Io { .. })));
+        assert!(matches!(Items::find(&root.join("none"), "", ""), Err(DataError::Io(_))));
     }
 
     #[test]

@@ -12,11 +12,12 @@ use std::collections::{BTreeMap, HashSet};
 use std::ops::Range;
 use std::path::Path;
 
+use freerange_core::{Invalid, check, sha256};
 use freerange_splat::Statistics;
 
 use crate::items::Input;
 use crate::sample::is_key;
-use crate::store::{Store, sha256};
+use crate::store::Store;
 use crate::{BuildConfig, DataError, Split};
 
 /// Version of the layout of shards and manifest.
@@ -47,11 +48,8 @@ impl Plan {
     /// # Errors
     /// [`DataError::Config`] for values that JSON cannot hold.
     pub fn sha256(&self) -> Result<String, DataError> {
-        let json = serde_json::to_vec(self).map_err(|e| DataError::Config {
-            field: "config".into(),
-            expected: "values JSON can hold".into(),
-            found: e.to_string(),
-        })?;
+        let json =
+            serde_json::to_vec(self).map_err(|e| DataError::from(Invalid::new("config", "values JSON can hold", e)))?;
         Ok(sha256(&json))
     }
 
@@ -61,7 +59,7 @@ impl Plan {
     /// [`DataError::Config`] and those of its parts.
     pub fn validate(&self) -> Result<(), DataError> {
         let objects = self.input.objects();
-        crate::validate::check((1..=MAX_OBJECTS).contains(&objects), "objects", "1 to 2^32", objects)?;
+        check((1..=MAX_OBJECTS).contains(&objects), "objects", "1 to 2^32", objects)?;
         self.config.validate()
     }
 

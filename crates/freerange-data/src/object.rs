@@ -5,7 +5,9 @@ use std::time::Instant;
 
 use freerange_camera::{Camera, View};
 use freerange_fit::{FitConfig, QuickFitConfig};
-use freerange_mesh::{CameraConfig, GeneratorConfig, LightingConfig, Mesh, Scene, generate, orbit_cameras, render};
+use freerange_generate::{GeneratorConfig, generate};
+use freerange_mesh::Mesh;
+use freerange_render::{CameraConfig, LightingConfig, Scene, orbit_cameras, render};
 use freerange_splat::{Alignment, Cloud, LodTree};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;

@@ -3,6 +3,7 @@
 use std::time::Instant;
 
 use freerange_camera::{Camera, View};
+use freerange_core::check;
 use freerange_fit::FitConfig;
 use freerange_metrics::psnr;
 use freerange_raster::RasterConfig;
@@ -13,7 +14,6 @@ use crate::build::{mesh_of, seed_of};
 use crate::fitted::{fitted_gaussians, polished};
 use crate::items::Item;
 use crate::object::{Photographed, Seconds, lap};
-use crate::validate::check;
 use crate::{BuildConfig, DataError, ObjectConfig, SurfaceConfig, surface_gaussians};
 
 /// Renders that agree to the last bit would have infinite PSNR; this keeps means finite.

@@ -15,7 +15,7 @@ use tokio::runtime::Runtime;
 use url::Url;
 
 use crate::DataError;
-use crate::store::io_error;
+use freerange_core::IoError;
 
 /// Bytes per part of an upload; S3 takes at most 10,000 parts, of at least 5 MiB but for the last.
 const PART: usize = 16 << 20;
@@ -84,7 +84,7 @@ impl Remote {
 
     fn wait<T>(&self, name: &str, work: impl Future<Output = object_store::Result<T>>) -> Result<T, DataError> {
         let done = runtime().and_then(|r| r.block_on(work).map_err(io::Error::from));
-        done.map_err(io_error(&self.path(name)))
+        Ok(done.map_err(IoError::at(&self.path(name)))?)
     }
 
     pub fn size(&self, name: &str) -> Result<Option<u64>, DataError> {
@@ -119,7 +119,7 @@ impl Remote {
         if bytes.len() as u64 != length {
             let short =
                 io::Error::new(io::ErrorKind::UnexpectedEof, format!("{length} bytes asked, {} given", bytes.len()));
-            return Err(io_error(&self.path(name))(short));
+            return Err(DataError::from(IoError::at(&self.path(name))(short)));
         }
         Ok(bytes.into())
     }
@@ -325,7 +325,7 @@ mod tests {
         bytes.chunks(1 << 20).for_each(|c| file.write_all(c).unwrap());
         assert_eq!(far.size("big").unwrap(), None);
         let (n, hash) = file.finish().unwrap();
-        assert_eq!((n, hash), (bytes.len() as u64, crate::store::sha256(&bytes)));
+        assert_eq!((n, hash), (bytes.len() as u64, freerange_core::sha256(&bytes)));
         assert!(far.read("big", 1 << 30).unwrap().unwrap() == bytes);
     }
 

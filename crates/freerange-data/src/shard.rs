@@ -7,10 +7,10 @@ use std::fs::File;
 use std::io::{BufReader, Cursor, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
+use freerange_core::IoError;
 use freerange_splat::Cloud;
 
 use crate::sample::{self, CAMERAS, GAUSSIANS, MAX_VIEWS, METADATA, Metadata, Place};
-use crate::store::io_error;
 use crate::{DataError, ImageFormat, Object};
 
 /// Largest entry, in bytes: bounds what a reader allocates.
@@ -47,7 +47,7 @@ pub(crate) fn tar_bytes(key: &str, entries: &[(String, Vec<u8>)], shard: &Path) 
         header.set_gid(0);
         header.set_mtime(0);
         header.set_size(content.len() as u64);
-        header.set_path(format!("{key}.{entry}")).map_err(io_error(shard))?;
+        header.set_path(format!("{key}.{entry}")).map_err(IoError::at(shard))?;
         header.set_cksum();
         bytes.extend_from_slice(header.as_bytes());
         bytes.extend_from_slice(content);
@@ -157,8 +157,8 @@ impl ShardReader {
     /// # Errors
     /// [`DataError::Sample`] or [`DataError::File`] where the file is no whole shard; [`DataError::Io`].
     pub fn open(path: &Path) -> Result<Self, DataError> {
-        let file = File::open(path).map_err(io_error(path))?;
-        let length = file.metadata().map_err(io_error(path))?.len();
+        let file = File::open(path).map_err(IoError::at(path))?;
+        let length = file.metadata().map_err(IoError::at(path))?.len();
         Ok(Self { path: path.into(), bytes: None, samples: index(BufReader::new(file), length, path, true)? })
     }
 
@@ -222,7 +222,7 @@ impl ShardReader {
 
     fn fetch(&self) -> Result<impl Fetch + '_, DataError> {
         let mut file = match self.bytes {
-            None => Some(File::open(&self.path).map_err(io_error(&self.path))?),
+            None => Some(File::open(&self.path).map_err(IoError::at(&self.path))?),
             Some(_) => None,
         };
         Ok(move |span: Span| {
@@ -234,7 +234,7 @@ impl ShardReader {
             let mut bytes = vec![0; span.size as usize];
             file.seek(SeekFrom::Start(span.offset))
                 .and_then(|_| file.read_exact(&mut bytes))
-                .map_err(io_error(&self.path))?;
+                .map_err(IoError::at(&self.path))?;
             Ok(bytes)
         })
     }
@@ -249,7 +249,7 @@ fn index(reader: impl Read + Seek, length: u64, path: &Path, whole: bool) -> Res
     let mut samples = Vec::new();
     let mut end = 0;
     // Raw: names beyond 100 bytes and the like are not written here, and need memory that the file decides on.
-    for entry in archive.entries_with_seek().map_err(io_error(path))?.raw(true) {
+    for entry in archive.entries_with_seek().map_err(IoError::at(path))?.raw(true) {
         let entry = entry.map_err(|e| problem(format!("not a tar file from byte {end}: {e}")))?;
         let bytes = entry.path_bytes();
         let name = std::str::from_utf8(&bytes).ok().and_then(|n| n.split_once('.')).filter(|(k, _)| sample::is_key(k));

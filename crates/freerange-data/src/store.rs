@@ -6,6 +6,7 @@ use std::fs::File;
 use std::io::{self, BufWriter, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
+use freerange_core::{IoError, hex};
 use sha2::{Digest, Sha256};
 
 use crate::DataError;
@@ -14,12 +15,6 @@ use crate::remote::Whole;
 
 /// What follows the name of a local file that is being written.
 pub(crate) const PARTIAL: &str = ".partial";
-
-/// Turns an I/O error into one that names `path`.
-pub(crate) fn io_error(path: &Path) -> impl FnOnce(io::Error) -> DataError {
-    let path = path.to_path_buf();
-    move |source| DataError::Io { path, source }
-}
 
 /// A folder of named files. Names are relative, with `/` between their parts.
 #[derive(Clone, Debug)]
@@ -103,10 +98,10 @@ impl Store {
                 let file = match File::open(&path) {
                     Ok(file) => file,
                     Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
-                    Err(e) => return Err(io_error(&path)(e)),
+                    Err(e) => return Err(DataError::from(IoError::at(&path)(e))),
                 };
                 let mut bytes = Vec::new();
-                file.take(most.saturating_add(1)).read_to_end(&mut bytes).map_err(io_error(&path))?;
+                file.take(most.saturating_add(1)).read_to_end(&mut bytes).map_err(IoError::at(&path))?;
                 if bytes.len() as u64 > most { Err(too_large()) } else { Ok(Some(bytes)) }
             }
             #[cfg(feature = "cloud")]
@@ -132,7 +127,7 @@ impl Store {
                         file.seek(SeekFrom::Start(offset))?;
                         file.read_exact(&mut bytes)
                     })
-                    .map_err(io_error(&path))?;
+                    .map_err(IoError::at(&path))?;
                 Ok(bytes)
             }
             #[cfg(feature = "cloud")]
@@ -166,7 +161,7 @@ impl Store {
             Place::Local(folder) => match std::fs::metadata(folder.join(name)) {
                 Ok(found) => Ok(found.is_file().then_some(found.len())),
                 Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(None),
-                Err(e) => Err(io_error(&folder.join(name))(e)),
+                Err(e) => Err(DataError::from(IoError::at(&folder.join(name))(e))),
             },
             #[cfg(feature = "cloud")]
             Place::Remote(remote) => remote.size(name),
@@ -182,12 +177,12 @@ impl Store {
         let sink = match &self.place {
             Place::Local(_) => {
                 if let Some(folder) = target.parent() {
-                    std::fs::create_dir_all(folder).map_err(io_error(folder))?;
+                    std::fs::create_dir_all(folder).map_err(IoError::at(folder))?;
                 }
                 let mut partial = target.clone().into_os_string();
                 partial.push(format!("{PARTIAL}{}", self.writer));
                 let partial = PathBuf::from(partial);
-                let file = File::create(&partial).map_err(io_error(&partial))?;
+                let file = File::create(&partial).map_err(IoError::at(&partial))?;
                 Sink::Local { writer: BufWriter::with_capacity(1 << 20, file), partial }
             }
             #[cfg(feature = "cloud")]
@@ -202,7 +197,7 @@ impl Store {
     /// [`DataError::Io`].
     pub(crate) fn write(&self, name: &str, bytes: &[u8]) -> Result<(), DataError> {
         let mut file = self.create(name)?;
-        file.write_all(bytes).map_err(io_error(&self.path(name)))?;
+        file.write_all(bytes).map_err(IoError::at(&self.path(name)))?;
         file.finish().map(|_| ())
     }
 
@@ -217,11 +212,11 @@ impl Store {
                 let entries = match std::fs::read_dir(&path) {
                     Ok(entries) => entries,
                     Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
-                    Err(e) => return Err(io_error(&path)(e)),
+                    Err(e) => return Err(DataError::from(IoError::at(&path)(e))),
                 };
                 let mut names = Vec::new();
                 for entry in entries {
-                    let entry = entry.map_err(io_error(&path))?;
+                    let entry = entry.map_err(IoError::at(&path))?;
                     if let Ok(found) = entry.file_name().into_string()
                         && !found.contains(PARTIAL)
                         && entry.path().is_file()
@@ -245,7 +240,9 @@ impl Store {
     pub(crate) fn remove_folder(&self, name: &str) -> Result<(), DataError> {
         match &self.place {
             Place::Local(folder) => match std::fs::remove_dir_all(folder.join(name)) {
-                Err(e) if e.kind() != io::ErrorKind::NotFound => Err(io_error(&folder.join(name))(e)),
+                Err(e) if e.kind() != io::ErrorKind::NotFound => {
+                    Err(DataError::from(IoError::at(&folder.join(name))(e)))
+                }
                 _ => Ok(()),
             },
             #[cfg(feature = "cloud")]
@@ -260,16 +257,16 @@ impl Store {
     /// [`DataError::File`] where another process has it; [`DataError::Io`].
     pub(crate) fn lock(&self) -> Result<Option<File>, DataError> {
         let Some(folder) = self.folder() else { return Ok(None) };
-        std::fs::create_dir_all(folder).map_err(io_error(folder))?;
+        std::fs::create_dir_all(folder).map_err(IoError::at(folder))?;
         let path = folder.join(format!(".lock{}", self.writer));
-        let file = File::create(&path).map_err(io_error(&path))?;
+        let file = File::create(&path).map_err(IoError::at(&path))?;
         match file.try_lock() {
             Ok(()) => Ok(Some(file)),
             Err(std::fs::TryLockError::WouldBlock) => Err(DataError::File {
                 path: folder.into(),
                 problem: "another process is making the same shards in this folder".into(),
             }),
-            Err(std::fs::TryLockError::Error(source)) => Err(DataError::Io { path, source }),
+            Err(std::fs::TryLockError::Error(source)) => Err(DataError::from(IoError { path, source })),
         }
     }
 
@@ -281,12 +278,12 @@ impl Store {
         let entries = match std::fs::read_dir(&path) {
             Ok(entries) => entries,
             Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(()),
-            Err(e) => return Err(io_error(&path)(e)),
+            Err(e) => return Err(DataError::from(IoError::at(&path)(e))),
         };
         for entry in entries {
-            let found = entry.map_err(io_error(&path))?.path();
+            let found = entry.map_err(IoError::at(&path))?.path();
             if found.file_name().and_then(|n| n.to_str()).is_some_and(|n| n.ends_with(&ending)) {
-                std::fs::remove_file(&found).map_err(io_error(&found))?;
+                std::fs::remove_file(&found).map_err(IoError::at(&found))?;
             }
         }
         Ok(())
@@ -326,15 +323,15 @@ impl NewFile {
                 if let Err(source) = done.and_then(|()| std::fs::rename(&partial, &self.target)) {
                     // The error that counts is the first one.
                     let _ = std::fs::remove_file(&partial);
-                    return Err(io_error(&self.target)(source));
+                    return Err(DataError::from(IoError::at(&self.target)(source)));
                 }
                 // The new name, too, must outlive a power cut.
                 if let Some(folder) = self.target.parent().filter(|p| !p.as_os_str().is_empty()) {
-                    freerange_splat::sync_folder(folder).map_err(io_error(folder))?;
+                    freerange_splat::sync_folder(folder).map_err(IoError::at(folder))?;
                 }
             }
             #[cfg(feature = "cloud")]
-            Some(Sink::Remote(upload)) => upload.finish().map_err(io_error(&self.target))?,
+            Some(Sink::Remote(upload)) => upload.finish().map_err(IoError::at(&self.target))?,
         }
         Ok((self.bytes, hex(&std::mem::take(&mut self.hash).finalize())))
     }
@@ -369,15 +366,6 @@ impl Drop for NewFile {
     }
 }
 
-/// SHA-256 of `bytes`, in hexadecimal.
-pub(crate) fn sha256(bytes: &[u8]) -> String {
-    hex(&Sha256::digest(bytes))
-}
-
-pub(crate) fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|b| format!("{b:02x}")).collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -398,7 +386,6 @@ mod tests {
         let (bytes, hash) = file.finish().unwrap();
         assert_eq!((bytes, store.read("b/a.bin", 3).unwrap()), (3, Some(b"abc".to_vec())));
         assert_eq!(hash, "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad");
-        assert_eq!(sha256(b"abc"), hash);
         assert_eq!((store.range("b/a.bin", 1, 2).unwrap(), store.size("b/a.bin").unwrap()), (b"bc".to_vec(), Some(3)));
         assert!(store.range("b/a.bin", 1, 3).is_err());
         assert!(store.read("b/a.bin", 2).unwrap_err().to_string().contains("at most 2 bytes"));

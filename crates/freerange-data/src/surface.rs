@@ -1,6 +1,6 @@
 //! Gaussians straight from a mesh: points by area, flat along the normal, coloured as rendered, opaque.
 
-use freerange_mesh::{Scene, sample_surface};
+use freerange_render::{Scene, sample_surface};
 use freerange_splat::{Cloud, channel};
 use glam::{Mat3, Quat, Vec3};
 use rand_chacha::ChaCha8Rng;

@@ -3,14 +3,7 @@
 use crate::input_fit::MIN_VIEWS;
 use crate::sample::{MAX_DEPTH, MAX_FITS, MAX_SIDE, MAX_VIEWS};
 use crate::{DataError, GaussianSource, ObjectConfig};
-
-/// Refuses with the field's name unless `ok`, which is written so that NaN fails it.
-pub(crate) fn check(ok: bool, field: &str, expected: &str, found: impl std::fmt::Debug) -> Result<(), DataError> {
-    match ok {
-        true => Ok(()),
-        false => Err(DataError::Config { field: field.into(), expected: expected.into(), found: format!("{found:?}") }),
-    }
-}
+use freerange_core::check;
 
 impl ObjectConfig {
     /// Checks every field.

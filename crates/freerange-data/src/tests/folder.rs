@@ -12,6 +12,7 @@ use crate::{
     ObjectSource, ShardConfig, ShardReader, Shards, Share, Split, Store, build, collect, contact_sheet, estimate,
     inspect,
 };
+use freerange_core::Invalid;
 
 fn one_of(index: u64, count: u64) -> BuildOptions {
     BuildOptions { share: Share { index, count }, ..BuildOptions::default() }
@@ -266,8 +267,7 @@ fn folders_are_merged_exactly() {
 #[test]
 fn failing_objects_are_recorded_and_the_rest_goes_on() {
     let folder = tempfile::tempdir().unwrap();
-    let broken =
-        |what: &str| DataError::Config { field: what.into(), expected: "a whole one".into(), found: "none".into() };
+    let broken = |what: &str| DataError::from(Invalid::new(what, "a whole one", "none"));
     let make = |seed| match seed % 4 {
         0 => Err(broken("mesh")),
         1 if seed == 13 => panic!("a bug"),

@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use freerange_camera::{Camera, View};
-use freerange_mesh::{CameraConfig, LightingConfig};
+use freerange_render::{CameraConfig, LightingConfig};
 use freerange_splat::{Cloud, channel};
 use glam::DVec3;
 use image::RgbaImage;

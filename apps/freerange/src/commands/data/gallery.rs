@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
+use freerange_data::{GalleryConfig, gallery};
 use freerange_flow::config::TrainConfig;
-use freerange_mesh::{GalleryConfig, gallery};
 
 use crate::error::CliError;
 
