@@ -69,6 +69,12 @@ pub struct Sampling {
     /// place where no view looks; 500 are enough, 0 is none [default: the checkpoint's].
     #[arg(long, value_name = "STEPS")]
     pub refine: Option<usize>,
+    /// Hold that refinement at the mean pictures of so many samples; 1 is the sample alone [default: the checkpoint's].
+    #[arg(long, value_name = "SAMPLES", value_parser = clap::value_parser!(u8).range(1..=64))]
+    pub ensemble: Option<u8>,
+    /// Mend a sample from pure noise in so many passes, as fits are mended; 0 is none [default: the checkpoint's].
+    #[arg(long, value_name = "PASSES")]
+    pub mend: Option<usize>,
     /// Seed of the (first) sample.
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
@@ -150,6 +156,8 @@ impl Sampling {
         sample.solver = self.solver.unwrap_or(sample.solver);
         sample.compute = self.compute.unwrap_or(sample.compute);
         sample.refine = self.refine.unwrap_or(sample.refine);
+        sample.mend = self.mend.unwrap_or(sample.mend);
+        sample.ensemble = self.ensemble.map_or(sample.ensemble, usize::from);
         options.seeds = (0..u64::from(samples)).map(|i| self.seed.wrapping_add(i)).collect();
         options.frame.up = self.up.or_z();
         model.check(&options)?;
