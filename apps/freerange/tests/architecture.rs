@@ -17,8 +17,9 @@ const ROOMS: &[(&str, &[&str])] = &[
     ("freerange-render", &["freerange-core", "freerange-camera", "freerange-mesh"]),
     ("freerange-generate", &["freerange-core", "freerange-mesh"]),
     ("freerange-fit", &["freerange-splat", "freerange-camera", "freerange-raster", "freerange-metrics"]),
+    ("freerange-data", &["freerange-core", "freerange-splat", "freerange-camera"]),
     (
-        "freerange-data",
+        "freerange-build",
         &[
             "freerange-core",
             "freerange-splat",
@@ -29,6 +30,7 @@ const ROOMS: &[(&str, &[&str])] = &[
             "freerange-render",
             "freerange-generate",
             "freerange-fit",
+            "freerange-data",
         ],
     ),
     (
@@ -40,6 +42,8 @@ const ROOMS: &[(&str, &[&str])] = &[
             "freerange-model",
             "freerange-fit",
             "freerange-data",
+            // For objects made on the fly.
+            "freerange-build",
         ],
     ),
     (
@@ -54,7 +58,10 @@ const ROOMS: &[(&str, &[&str])] = &[
             "freerange-flow",
         ],
     ),
-    ("freerange-eval", &["freerange-splat", "freerange-camera", "freerange-raster", "freerange-metrics"]),
+    (
+        "freerange-eval",
+        &["freerange-core", "freerange-splat", "freerange-camera", "freerange-raster", "freerange-metrics"],
+    ),
     ("freerange-cli", &["*"]),
 ];
 

@@ -67,22 +67,20 @@ pub enum DataError {
         /// What was wrong with the last one.
         last: Box<DataError>,
     },
-    /// The choice of views.
+    /// A source other than shards has no object for a number.
+    #[error(transparent)]
+    Source(Box<dyn std::error::Error + Send + Sync>),
+    /// The cameras.
     #[error(transparent)]
     Camera(#[from] freerange_camera::CameraError),
     /// The Gaussians or their tree.
     #[error(transparent)]
     Splat(#[from] freerange_splat::SplatError),
-    /// The mesh or its renderer.
-    #[error(transparent)]
-    Mesh(#[from] freerange_mesh::MeshError),
-    /// The rasteriser.
-    #[error(transparent)]
-    Raster(#[from] freerange_raster::RasterError),
-    /// The measures of image quality.
-    #[error(transparent)]
-    Metrics(#[from] freerange_metrics::MetricsError),
-    /// The fit.
-    #[error(transparent)]
-    Fit(#[from] freerange_fit::FitError),
+}
+
+impl DataError {
+    /// The error of a source of its own kind.
+    pub fn from_source(error: impl std::error::Error + Send + Sync + 'static) -> Self {
+        Self::Source(Box::new(error))
+    }
 }

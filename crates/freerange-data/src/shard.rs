@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use freerange_core::IoError;
 use freerange_splat::Cloud;
 
-use crate::sample::{self, CAMERAS, GAUSSIANS, MAX_VIEWS, METADATA, Metadata, Place};
+use crate::sample::{self, CAMERAS, EntryOfShard, GAUSSIANS, MAX_VIEWS, METADATA, Metadata};
 use crate::{DataError, ImageFormat, Object};
 
 /// Largest entry, in bytes: bounds what a reader allocates.
@@ -20,13 +20,13 @@ const MAX_SAMPLES: usize = 1 << 20;
 /// Tar files consist of blocks of this many bytes.
 const BLOCK: u64 = 512;
 /// What ends a tar file: two zero blocks.
-pub(crate) const END: [u8; 2 * BLOCK as usize] = [0; 2 * BLOCK as usize];
+pub const END: [u8; 2 * BLOCK as usize] = [0; 2 * BLOCK as usize];
 
 /// The entries of one object as they stand in a shard: a tar file without its end.
 ///
 /// # Errors
 /// [`DataError::Sample`] for an object that could not be read back.
-pub(crate) fn object_bytes(
+pub fn object_bytes(
     object: &Object,
     leaves: Option<&Cloud>,
     metadata: &Metadata,
@@ -37,7 +37,10 @@ pub(crate) fn object_bytes(
 }
 
 /// Entries `KEY.NAME` as a tar file without its end.
-pub(crate) fn tar_bytes(key: &str, entries: &[(String, Vec<u8>)], shard: &Path) -> Result<Vec<u8>, DataError> {
+///
+/// # Errors
+/// [`DataError::Io`] for a name that no tar file can hold.
+pub fn tar_bytes(key: &str, entries: &[(String, Vec<u8>)], shard: &Path) -> Result<Vec<u8>, DataError> {
     let mut bytes = Vec::new();
     for (entry, content) in entries {
         let mut header = tar::Header::new_ustar();
@@ -75,7 +78,7 @@ struct Sample {
 
 impl Sample {
     fn object(&self, path: &Path, depths: &[u32], mut fetch: impl Fetch) -> Result<Object, DataError> {
-        let place = Place { shard: path, sample: &self.key, entry: METADATA };
+        let place = EntryOfShard { shard: path, sample: &self.key, entry: METADATA };
         let cameras = fetch(self.cameras)?;
         let cameras = sample::decode_cameras(&cameras, self.views.len(), place.of(CAMERAS))?;
         let gaussians = fetch(self.gaussians)?;
@@ -91,12 +94,12 @@ impl Sample {
     }
 
     fn metadata(&self, path: &Path, mut fetch: impl Fetch) -> Result<Metadata, DataError> {
-        let place = Place { shard: path, sample: &self.key, entry: METADATA };
+        let place = EntryOfShard { shard: path, sample: &self.key, entry: METADATA };
         sample::decode_metadata(&fetch(self.metadata)?, place)
     }
 
     fn leaves(&self, path: &Path, mut fetch: impl Fetch) -> Result<Option<Cloud>, DataError> {
-        let place = Place { shard: path, sample: &self.key, entry: GAUSSIANS };
+        let place = EntryOfShard { shard: path, sample: &self.key, entry: GAUSSIANS };
         sample::decode_leaves(&fetch(self.gaussians)?, place)
     }
 }
@@ -106,7 +109,7 @@ trait Fetch: FnMut(Span) -> Result<Vec<u8>, DataError> {}
 impl<F: FnMut(Span) -> Result<Vec<u8>, DataError>> Fetch for F {}
 
 /// The entries of one object, read as a whole.
-pub(crate) struct ObjectBytes {
+pub struct ObjectBytes {
     path: PathBuf,
     bytes: Vec<u8>,
     sample: Sample,
@@ -114,6 +117,9 @@ pub(crate) struct ObjectBytes {
 
 impl ObjectBytes {
     /// `bytes`: those of the object `key` in the shard `path`, which only messages name.
+    ///
+    /// # Errors
+    /// [`DataError::File`] where they are not.
     pub fn new(bytes: Vec<u8>, key: &str, path: PathBuf) -> Result<Self, DataError> {
         let samples = index(Cursor::new(&bytes), bytes.len() as u64, &path, false)?;
         let found = samples.iter().map(|s| s.key.as_ref()).collect::<Vec<_>>().join(", ");
@@ -131,14 +137,26 @@ impl ObjectBytes {
         |s: Span| Ok(self.bytes[s.offset as usize..(s.offset + s.size) as usize].to_vec())
     }
 
+    /// The object, with its slices at `depths`.
+    ///
+    /// # Errors
+    /// [`DataError::Sample`] for a broken entry.
     pub fn object(&self, depths: &[u32]) -> Result<Object, DataError> {
         self.sample.object(&self.path, depths, self.fetch())
     }
 
+    /// What is known of it besides its views and Gaussians.
+    ///
+    /// # Errors
+    /// [`DataError::Sample`] for a broken entry.
     pub fn metadata(&self) -> Result<Metadata, DataError> {
         self.sample.metadata(&self.path, self.fetch())
     }
 
+    /// The Gaussians before the tree, where they are kept.
+    ///
+    /// # Errors
+    /// [`DataError::Sample`] for a broken entry.
     pub fn leaves(&self) -> Result<Option<Cloud>, DataError> {
         self.sample.leaves(&self.path, self.fetch())
     }
@@ -256,7 +274,7 @@ fn index(reader: impl Read + Seek, length: u64, path: &Path, whole: bool) -> Res
         let Some((key, rest)) = name else {
             return Err(problem(format!("expected entries called KEY.*, found {:?}", String::from_utf8_lossy(&bytes))));
         };
-        let place = Place { shard: path, sample: key, entry: rest };
+        let place = EntryOfShard { shard: path, sample: key, entry: rest };
         if !entry.header().entry_type().is_file() {
             return Err(place.error("a regular file", format!("{:?}", entry.header().entry_type())));
         }
@@ -303,7 +321,7 @@ struct Draft {
 }
 
 impl Draft {
-    fn add(&mut self, name: &str, span: Span, place: Place) -> Result<(), DataError> {
+    fn add(&mut self, name: &str, span: Span, place: EntryOfShard) -> Result<(), DataError> {
         let next = |format| sample::view_entry(self.views.len(), format);
         let is_view = |format| self.format.is_none_or(|f| f == format) && name == next(format);
         if let Some(format) = [ImageFormat::Webp, ImageFormat::Png].into_iter().find(|f| is_view(*f))
@@ -328,7 +346,7 @@ impl Draft {
 
     fn finish(self, shard: &Path) -> Result<Sample, DataError> {
         let need = |span: Option<Span>, entry| {
-            span.ok_or_else(|| Place { shard, sample: &self.key, entry }.error("this entry", "none"))
+            span.ok_or_else(|| EntryOfShard { shard, sample: &self.key, entry }.error("this entry", "none"))
         };
         let (metadata, cameras) = (need(self.metadata, METADATA)?, need(self.cameras, CAMERAS)?);
         let gaussians = need(self.gaussians, GAUSSIANS)?;

@@ -19,13 +19,13 @@ pub(crate) const PARTIAL: &str = ".partial";
 /// A folder of named files. Names are relative, with `/` between their parts.
 #[derive(Clone, Debug)]
 pub struct Store {
-    place: Place,
+    location: Location,
     /// Tells the unfinished files of one writer from those of another.
     writer: String,
 }
 
 #[derive(Clone, Debug)]
-enum Place {
+enum Location {
     Local(PathBuf),
     #[cfg(feature = "cloud")]
     Remote(crate::remote::Remote),
@@ -38,10 +38,10 @@ impl Store {
     /// # Errors
     /// [`DataError::Store`] for a URL that cannot be used, or where this program was built without the feature `cloud`.
     pub fn open(location: &str) -> Result<Self, DataError> {
-        let place = match location.split_once("://") {
-            None => Place::Local(location.into()),
+        let location = match location.split_once("://") {
+            None => Location::Local(location.into()),
             #[cfg(feature = "cloud")]
-            Some(_) => Place::Remote(crate::remote::Remote::open(location)?),
+            Some(_) => Location::Remote(crate::remote::Remote::open(location)?),
             #[cfg(not(feature = "cloud"))]
             Some(_) => {
                 return Err(DataError::Store {
@@ -50,39 +50,40 @@ impl Store {
                 });
             }
         };
-        Ok(Self { place, writer: String::new() })
+        Ok(Self { location, writer: String::new() })
     }
 
     /// The local folder `path`.
     pub fn local(path: &Path) -> Self {
-        Self { place: Place::Local(path.into()), writer: String::new() }
+        Self { location: Location::Local(path.into()), writer: String::new() }
     }
 
-    #[cfg(all(test, feature = "cloud"))]
-    pub(crate) fn remote(remote: crate::remote::Remote) -> Self {
-        Self { place: Place::Remote(remote), writer: String::new() }
+    /// An object store that goes away with its last copy, as those that URLs name in all else: for tests.
+    #[cfg(feature = "cloud")]
+    pub fn in_memory() -> Self {
+        Self { location: Location::Remote(crate::remote::Remote::in_memory()), writer: String::new() }
     }
 
     /// The same place, written to by `writer`: no two may write at once under one name.
-    pub(crate) fn written_by(&self, writer: String) -> Self {
+    pub fn written_by(&self, writer: String) -> Self {
         Self { writer, ..self.clone() }
     }
 
     /// The local folder, if it is one.
     pub fn folder(&self) -> Option<&Path> {
-        match &self.place {
-            Place::Local(folder) => Some(folder),
+        match &self.location {
+            Location::Local(folder) => Some(folder),
             #[cfg(feature = "cloud")]
-            Place::Remote(_) => None,
+            Location::Remote(_) => None,
         }
     }
 
     /// `name` as it is called in messages.
-    pub(crate) fn path(&self, name: &str) -> PathBuf {
-        match &self.place {
-            Place::Local(folder) => folder.join(name),
+    pub fn path(&self, name: &str) -> PathBuf {
+        match &self.location {
+            Location::Local(folder) => folder.join(name),
             #[cfg(feature = "cloud")]
-            Place::Remote(remote) => remote.path(name),
+            Location::Remote(remote) => remote.path(name),
         }
     }
 
@@ -90,11 +91,11 @@ impl Store {
     ///
     /// # Errors
     /// [`DataError::Io`]; [`DataError::File`] for more than `most` bytes.
-    pub(crate) fn read(&self, name: &str, most: u64) -> Result<Option<Vec<u8>>, DataError> {
+    pub fn read(&self, name: &str, most: u64) -> Result<Option<Vec<u8>>, DataError> {
         let path = self.path(name);
         let too_large = || DataError::File { path: path.clone(), problem: format!("expected at most {most} bytes") };
-        match &self.place {
-            Place::Local(_) => {
+        match &self.location {
+            Location::Local(_) => {
                 let file = match File::open(&path) {
                     Ok(file) => file,
                     Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
@@ -105,7 +106,7 @@ impl Store {
                 if bytes.len() as u64 > most { Err(too_large()) } else { Ok(Some(bytes)) }
             }
             #[cfg(feature = "cloud")]
-            Place::Remote(remote) => match remote.read(name, most)? {
+            Location::Remote(remote) => match remote.read(name, most)? {
                 Whole::Here(bytes) => Ok(Some(bytes)),
                 Whole::TooLarge => Err(too_large()),
                 Whole::Missing => Ok(None),
@@ -117,9 +118,9 @@ impl Store {
     ///
     /// # Errors
     /// [`DataError::Io`], also where the file ends before.
-    pub(crate) fn range(&self, name: &str, offset: u64, length: u64) -> Result<Vec<u8>, DataError> {
-        match &self.place {
-            Place::Local(folder) => {
+    pub fn range(&self, name: &str, offset: u64, length: u64) -> Result<Vec<u8>, DataError> {
+        match &self.location {
+            Location::Local(folder) => {
                 let path = folder.join(name);
                 let mut bytes = vec![0; length as usize];
                 File::open(&path)
@@ -131,7 +132,7 @@ impl Store {
                 Ok(bytes)
             }
             #[cfg(feature = "cloud")]
-            Place::Remote(remote) => remote.range(name, offset, length),
+            Location::Remote(remote) => remote.range(name, offset, length),
         }
     }
 
@@ -139,7 +140,7 @@ impl Store {
     ///
     /// # Errors
     /// [`DataError::Io`], also where the file ends before; those of `take`.
-    pub(crate) fn pieces(
+    pub fn pieces(
         &self,
         name: &str,
         length: u64,
@@ -156,15 +157,15 @@ impl Store {
     ///
     /// # Errors
     /// [`DataError::Io`].
-    pub(crate) fn size(&self, name: &str) -> Result<Option<u64>, DataError> {
-        match &self.place {
-            Place::Local(folder) => match std::fs::metadata(folder.join(name)) {
+    pub fn size(&self, name: &str) -> Result<Option<u64>, DataError> {
+        match &self.location {
+            Location::Local(folder) => match std::fs::metadata(folder.join(name)) {
                 Ok(found) => Ok(found.is_file().then_some(found.len())),
                 Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(None),
                 Err(e) => Err(DataError::from(IoError::at(&folder.join(name))(e))),
             },
             #[cfg(feature = "cloud")]
-            Place::Remote(remote) => remote.size(name),
+            Location::Remote(remote) => remote.size(name),
         }
     }
 
@@ -172,10 +173,10 @@ impl Store {
     ///
     /// # Errors
     /// [`DataError::Io`].
-    pub(crate) fn create(&self, name: &str) -> Result<NewFile, DataError> {
+    pub fn create(&self, name: &str) -> Result<NewFile, DataError> {
         let target = self.path(name);
-        let sink = match &self.place {
-            Place::Local(_) => {
+        let sink = match &self.location {
+            Location::Local(_) => {
                 if let Some(folder) = target.parent() {
                     std::fs::create_dir_all(folder).map_err(IoError::at(folder))?;
                 }
@@ -186,7 +187,7 @@ impl Store {
                 Sink::Local { writer: BufWriter::with_capacity(1 << 20, file), partial }
             }
             #[cfg(feature = "cloud")]
-            Place::Remote(remote) => Sink::Remote(remote.create(name)?),
+            Location::Remote(remote) => Sink::Remote(remote.create(name)?),
         };
         Ok(NewFile { target, sink: Some(sink), hash: Sha256::new(), bytes: 0 })
     }
@@ -195,7 +196,7 @@ impl Store {
     ///
     /// # Errors
     /// [`DataError::Io`].
-    pub(crate) fn write(&self, name: &str, bytes: &[u8]) -> Result<(), DataError> {
+    pub fn write(&self, name: &str, bytes: &[u8]) -> Result<(), DataError> {
         let mut file = self.create(name)?;
         file.write_all(bytes).map_err(IoError::at(&self.path(name)))?;
         file.finish().map(|_| ())
@@ -205,9 +206,9 @@ impl Store {
     ///
     /// # Errors
     /// [`DataError::Io`].
-    pub(crate) fn list(&self, name: &str) -> Result<Vec<String>, DataError> {
-        let mut names = match &self.place {
-            Place::Local(folder) => {
+    pub fn list(&self, name: &str) -> Result<Vec<String>, DataError> {
+        let mut names = match &self.location {
+            Location::Local(folder) => {
                 let path = folder.join(name);
                 let entries = match std::fs::read_dir(&path) {
                     Ok(entries) => entries,
@@ -227,7 +228,7 @@ impl Store {
                 names
             }
             #[cfg(feature = "cloud")]
-            Place::Remote(remote) => remote.list(name)?,
+            Location::Remote(remote) => remote.list(name)?,
         };
         names.sort_unstable();
         Ok(names)
@@ -237,16 +238,16 @@ impl Store {
     ///
     /// # Errors
     /// [`DataError::Io`].
-    pub(crate) fn remove_folder(&self, name: &str) -> Result<(), DataError> {
-        match &self.place {
-            Place::Local(folder) => match std::fs::remove_dir_all(folder.join(name)) {
+    pub fn remove_folder(&self, name: &str) -> Result<(), DataError> {
+        match &self.location {
+            Location::Local(folder) => match std::fs::remove_dir_all(folder.join(name)) {
                 Err(e) if e.kind() != io::ErrorKind::NotFound => {
                     Err(DataError::from(IoError::at(&folder.join(name))(e)))
                 }
                 _ => Ok(()),
             },
             #[cfg(feature = "cloud")]
-            Place::Remote(remote) => remote.remove(name),
+            Location::Remote(remote) => remote.remove(name),
         }
     }
 
@@ -255,7 +256,7 @@ impl Store {
     ///
     /// # Errors
     /// [`DataError::File`] where another process has it; [`DataError::Io`].
-    pub(crate) fn lock(&self) -> Result<Option<File>, DataError> {
+    pub fn lock(&self) -> Result<Option<File>, DataError> {
         let Some(folder) = self.folder() else { return Ok(None) };
         std::fs::create_dir_all(folder).map_err(IoError::at(folder))?;
         let path = folder.join(format!(".lock{}", self.writer));
@@ -271,7 +272,10 @@ impl Store {
     }
 
     /// Removes what a killed process of the same writer left unfinished outside of folders of their own.
-    pub(crate) fn remove_partial_files(&self, folder: &str) -> Result<(), DataError> {
+    ///
+    /// # Errors
+    /// [`DataError::Io`].
+    pub fn remove_partial_files(&self, folder: &str) -> Result<(), DataError> {
         let Some(root) = self.folder() else { return Ok(()) };
         let path = root.join(folder);
         let ending = format!("{PARTIAL}{}", self.writer);
@@ -291,7 +295,7 @@ impl Store {
 }
 
 /// A file under construction. Dropped unfinished, it goes away; killed, a local one stays as `*.partial*`.
-pub(crate) struct NewFile {
+pub struct NewFile {
     target: PathBuf,
     sink: Option<Sink>, // none once closed
     hash: Sha256,
@@ -314,6 +318,9 @@ impl NewFile {
     }
 
     /// Makes the bytes permanent, then gives the file its name. Returns its size and SHA-256.
+    ///
+    /// # Errors
+    /// [`DataError::Io`]; no file has the name then.
     pub fn finish(mut self) -> Result<(u64, String), DataError> {
         match self.sink.take() {
             None => {}

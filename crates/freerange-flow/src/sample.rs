@@ -460,7 +460,7 @@ pub fn reconstruct(
         let guess = match starts {
             None => None,
             Some((_, fits)) => {
-                let slice = tree_slice(&fits[object], n.ilog2()).map_err(freerange_data::DataError::from)?;
+                let slice = tree_slice(&fits[object], n.ilog2()).map_err(freerange_build::BuildError::from)?;
                 Some(checkpoint.normalization.normalize(&slice))
             }
         };

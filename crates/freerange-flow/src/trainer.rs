@@ -12,7 +12,8 @@ use burn::{
     store::ModuleRecord,
     tensor::{Device, Tensor},
 };
-use freerange_data::{Generated, Object, ObjectSource, Shards, Split, Store, Stream};
+use freerange_build::Generated;
+use freerange_data::{Object, ObjectSource, Shards, Split, Store, Stream};
 use freerange_model::{Checkpoint, Compute, Dinov2, EncoderConfig, FreeRange, ModelConfig, WeightsOrigin};
 use freerange_splat::{Normalization, Statistics, channel, sync_folder, sync_tree};
 use rand::seq::index::sample as sample_indices;
@@ -37,7 +38,7 @@ const NOT_FINITE_IN_A_ROW: u32 = 5;
 
 /// What is reported after a step.
 #[derive(Clone, Debug, serde::Serialize)]
-pub struct Report {
+pub struct StepReport {
     /// Steps taken so far, this one included.
     pub step: u64,
     /// Total loss.
@@ -351,7 +352,7 @@ impl Trainer {
     /// Takes one step. A step whose loss or gradients are not finite changes no weights.
     ///
     /// After an error, too, [`save`](Self::save) keeps what was reached before it.
-    pub fn step(&mut self) -> Result<Report, FlowError> {
+    pub fn step(&mut self) -> Result<StepReport, FlowError> {
         let begin = Instant::now();
         let index = self.progress.step;
         let (stage, total_steps) = (self.config.stage(index).clone(), self.config.total_steps());
@@ -429,7 +430,7 @@ impl Trainer {
         if self.not_finite == NOT_FINITE_IN_A_ROW {
             return Err(FlowError::NotFinite { steps: self.not_finite, last: p.step, loss: total, norm });
         }
-        Ok(Report {
+        Ok(StepReport {
             step: self.progress.step,
             loss: total,
             flow,

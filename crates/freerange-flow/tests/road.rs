@@ -3,8 +3,9 @@
 use std::{ops::ControlFlow, sync::Arc};
 
 use burn::tensor::Device;
+use freerange_build::Generated;
 use freerange_camera::{View, image_ops::composite};
-use freerange_data::{Generated, ObjectSource};
+use freerange_data::ObjectSource;
 use freerange_flow::{
     FlowError,
     batch::{Batch, step_rng},

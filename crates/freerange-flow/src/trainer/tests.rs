@@ -1,6 +1,6 @@
 use std::io::{Seek, SeekFrom, Write};
 
-use freerange_data::{BuildOptions, Items, build};
+use freerange_build::{BuildOptions, Items, build};
 
 use super::*;
 use crate::sample::SampleConfig;

@@ -3,8 +3,8 @@
 use std::{ops::ControlFlow, path::Path, time::Instant};
 
 use burn::tensor::{Distribution, Tensor};
+use freerange_build::{GaussianSource, generate_object};
 use freerange_camera::View;
-use freerange_data::{GaussianSource, Object};
 use freerange_fit::quick_fit;
 use freerange_flow::{
     batch::{Conditioning, shrink},
@@ -100,7 +100,7 @@ pub fn sample(
     let config = load(size)?;
     let (stage, device) = (config.stage(u64::MAX).clone(), &timer.device);
     let model_config = ModelConfig { image_size: stage.image_size, ..config.model.clone() };
-    let object = Object::generate(7, &config.data.object, &[stage.depth])?;
+    let object = generate_object(7, &config.data.object, &[stage.depth])?;
     let mut statistics = Statistics::default();
     statistics.add(object.slice(stage.depth)?)?;
     let rng = &mut rand_chacha::ChaCha8Rng::seed_from_u64(1);

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use freerange_data::{GalleryConfig, gallery};
+use freerange_build::{GalleryConfig, gallery};
 use freerange_flow::config::TrainConfig;
 
 use crate::error::CliError;
@@ -30,7 +30,6 @@ pub struct Args {
     first_seed: u64,
 }
 
-/// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
     let object = TrainConfig::load(&args.config)?.data.object;
     let config = GalleryConfig {

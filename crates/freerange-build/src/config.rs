@@ -2,44 +2,11 @@
 
 use freerange_camera::SelectionConfig;
 use freerange_core::{Invalid, check};
+use freerange_data::ImageFormat;
+use freerange_data::layout::MAX_DEPTH;
 use freerange_mesh::LoadLimits;
 
-use crate::sample::MAX_DEPTH;
-use crate::{DataError, ObjectConfig};
-
-/// A part of the data.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, serde::Serialize, serde::Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Split {
-    /// What models are trained on.
-    #[default]
-    Train,
-    /// For choices between models.
-    Validation,
-    /// For the final figures.
-    Test,
-}
-
-/// How views are stored, without loss in both.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum ImageFormat {
-    /// PNG: decodes faster.
-    Png,
-    /// WebP: smaller.
-    #[default]
-    Webp,
-}
-
-impl ImageFormat {
-    /// Ending of file names.
-    pub fn ending(self) -> &'static str {
-        match self {
-            Self::Png => "png",
-            Self::Webp => "webp",
-        }
-    }
-}
+use crate::{BuildError, ObjectConfig};
 
 /// What is stored of each object, and how objects are divided.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
@@ -133,7 +100,7 @@ impl BuildConfig {
     ///
     /// # Errors
     /// As [`ObjectConfig::validate`].
-    pub fn validate(&self) -> Result<(), DataError> {
+    pub fn validate(&self) -> Result<(), BuildError> {
         let ascending = self.depths.is_sorted_by(|a, b| a < b) && self.depths.iter().all(|d| *d <= MAX_DEPTH);
         let expected = format!("one or more ascending depths up to {MAX_DEPTH}");
         check(ascending && !self.depths.is_empty(), "depths", &expected, &self.depths)?;

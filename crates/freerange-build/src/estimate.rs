@@ -3,9 +3,9 @@
 use crate::build::{BuildOptions, Done, build};
 use crate::items::Items;
 use crate::object::Seconds;
-use crate::store::Store;
-use crate::{BuildConfig, DataError, HeldOutPsnr};
+use crate::{BuildConfig, BuildError};
 use freerange_core::{Invalid, IoError};
+use freerange_data::{HeldOutPsnr, Store};
 
 /// Costs per object, measured.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
@@ -41,13 +41,13 @@ impl Estimate {
 /// Makes `sample` of the items, evenly spread over all, in a temporary folder, on all cores.
 ///
 /// # Errors
-/// As [`build`]; [`DataError::Config`] where none could be made.
+/// As [`build`]; [`BuildError::Config`] where none could be made.
 pub fn estimate(
     config: &BuildConfig,
     items: &Items,
     sample: u64,
     progress: impl Fn(Done) + Sync,
-) -> Result<Estimate, DataError> {
+) -> Result<Estimate, BuildError> {
     let folder = tempfile::tempdir().map_err(IoError::at(&std::env::temp_dir()))?;
     let some = items.spread(sample);
     // One core per worker, as in a large job: several cores within one object would hide their waiting.
@@ -55,7 +55,7 @@ pub fn estimate(
     let options = BuildOptions { workers, ..BuildOptions::default() };
     let summary = build(config, &some, &Store::local(folder.path()), &options, progress)?;
     if summary.made == 0 {
-        return Err(DataError::from(Invalid::new(
+        return Err(BuildError::from(Invalid::new(
             "sample",
             "at least one object that can be made",
             summary.failures.first().map_or("none".into(), |f| format!("{}: {}", f.id, f.reason)),

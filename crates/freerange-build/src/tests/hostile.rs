@@ -5,9 +5,10 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::{build_toys, message, metadata_of, open, toy, write_shard};
-use crate::sample::encode;
-use crate::shard::{END, tar_bytes};
-use crate::{BuildOptions, DataError, ImageFormat, Manifest, ShardReader, Store, inspect};
+use crate::BuildOptions;
+use freerange_data::layout::encode;
+use freerange_data::layout::{END, tar_bytes};
+use freerange_data::{DataError, ImageFormat, Manifest, ShardReader, Store, inspect};
 
 /// A shard of two toys.
 fn shard(folder: &Path) -> (PathBuf, Vec<u8>) {
@@ -192,7 +193,9 @@ fn manifests_that_do_not_fit_are_refused() {
     };
     refused("{", "", "expected a description");
     refused("\"format\":2", "\"format\":3,\"news\":0", "expected 2, found 3");
-    refused("\"config\":{", "\"config\":{\"news\":0,", "news");
+    refused("\"config\":{", "\"config\":{\"news\":0,", "plan_sha256");
+    refused("\"depths\":", "\"deaths\":", "depths");
+    refused("\"depths\":[2,3]", "\"depths\":[3,2]", "plan.depths");
     refused("\"objects\":10", "\"objects\":0", "plan.objects");
     refused("\"objects\":10", "\"objects\":4000000000", "plan_sha256");
     refused("\"index\":1,\"plan", "\"index\":0,\"plan", "shards.index");

@@ -13,18 +13,19 @@ use std::time::Instant;
 
 use freerange_camera::{SelectionConfig, View, ViewSets, select_views};
 use freerange_core::{Invalid, IoError, Share, sha256};
+use freerange_data::layout::{END, ObjectBytes, PLAN, object_bytes, record_name, shard_name, to_json};
+use freerange_data::{
+    DataError, FORMAT, Failure, HeldOutPsnr, Manifest, Metadata, Object, ObjectRecord, Plan, Recipe, ShardRecord,
+    Split, Store,
+};
 use freerange_generate::generate;
 use freerange_mesh::{Mesh, load_mesh};
 use freerange_splat::Statistics;
 use glam::DVec3;
 
 use crate::items::{Item, Items, draw};
-use crate::manifest::{FORMAT, Failure, Manifest, ObjectRecord, Plan, ShardRecord, record_name, shard_name, to_json};
-use crate::object::{Made, Photographed, Seconds, lap, make};
-use crate::sample::Metadata;
-use crate::shard::{END, ObjectBytes, object_bytes};
-use crate::store::Store;
-use crate::{BuildConfig, DataError, HeldOutPsnr, Object, Split};
+use crate::object::{MadeObject, Photographed, Seconds, add_elapsed, make};
+use crate::{BuildConfig, BuildError};
 
 /// Largest finished object, in bytes.
 const MAX_PART: u64 = 4 << 30;
@@ -83,15 +84,15 @@ pub struct Summary {
 /// on the number of workers or on how the work is shared; they are the same on machines of one instruction set.
 ///
 /// # Errors
-/// As [`Plan::validate`]; [`DataError::File`] where the place holds shards of another plan, or another process makes the
-/// same share; [`DataError::Io`]. Single objects that cannot be made are recorded with their reason.
+/// As [`Plan::validate`]; [`BuildError::Data`] where the place holds shards of another plan, where another process makes
+/// the same share, or where it cannot be written to. Single objects that cannot be made are recorded with their reason.
 pub fn build(
     config: &BuildConfig,
     items: &Items,
     store: &Store,
     options: &BuildOptions,
     progress: impl Fn(Done) + Sync,
-) -> Result<Summary, DataError> {
+) -> Result<Summary, BuildError> {
     build_with(config, items, store, options, progress, |item| make_item(item, config))
 }
 
@@ -102,10 +103,11 @@ pub(crate) fn build_with(
     store: &Store,
     options: &BuildOptions,
     progress: impl Fn(Done) + Sync,
-    make: impl Fn(&Item) -> Result<(Made, FileFacts), DataError> + Sync,
-) -> Result<Summary, DataError> {
-    let plan = Plan { format: FORMAT, config: config.clone(), input: items.describe() };
+    make: impl Fn(&Item) -> Result<(MadeObject, FileFacts), BuildError> + Sync,
+) -> Result<Summary, BuildError> {
+    let plan = Plan { format: FORMAT, config: Recipe::new(config)?, input: items.describe() };
     plan.validate()?;
+    config.validate()?;
     let Share { index, count } = options.share;
     let store = store.written_by(format!("-{index}-of-{count}"));
     let _lock = store.lock()?;
@@ -116,6 +118,7 @@ pub(crate) fn build_with(
     let all: u64 = mine().map(|s| plan.shard_objects(s)).map(|r| r.end - r.start).sum();
     let work = Work {
         plan: &plan,
+        config,
         plan_sha256: plan.sha256()?,
         items,
         store: &store,
@@ -156,10 +159,10 @@ pub(crate) fn build_with(
 /// Writes the manifest of `store` if all its shards are there. Returns what is there.
 ///
 /// # Errors
-/// [`DataError::Io`]; [`DataError::File`] where there is no plan or a broken record.
-pub fn merge(store: &Store) -> Result<Manifest, DataError> {
+/// [`BuildError::Data`], also where there is no plan or a broken record.
+pub fn merge(store: &Store) -> Result<Manifest, BuildError> {
     let plan = Plan::load(store)?.ok_or_else(|| DataError::File {
-        path: store.path(crate::manifest::PLAN),
+        path: store.path(PLAN),
         problem: "expected a folder of shards, found none".into(),
     })?;
     let manifest = Manifest::gather(store, plan)?;
@@ -172,9 +175,8 @@ pub fn merge(store: &Store) -> Result<Manifest, DataError> {
 /// Copies the finished shards of `other` that `store` lacks. Returns their number.
 ///
 /// # Errors
-/// [`DataError::File`] where `other` was made with another plan, or one of its shards is not what its record says;
-/// [`DataError::Io`].
-pub fn collect(store: &Store, other: &Store) -> Result<u64, DataError> {
+/// [`BuildError::Data`] where `other` was made with another plan, or one of its shards is not what its record says.
+pub fn collect(store: &Store, other: &Store) -> Result<u64, BuildError> {
     let manifest = Manifest::load(other)?;
     agree(store, &manifest.plan)?;
     let mut copied = 0;
@@ -190,7 +192,7 @@ pub fn collect(store: &Store, other: &Store) -> Result<u64, DataError> {
         let found = file.sha256();
         if found != record.sha256 {
             let problem = format!("expected SHA-256 {} as in its record, found {found}", record.sha256);
-            return Err(DataError::File { path: other.path(&name), problem });
+            return Err(DataError::File { path: other.path(&name), problem }.into());
         }
         file.finish()?;
         let record_name = record_name(record.index);
@@ -201,10 +203,10 @@ pub fn collect(store: &Store, other: &Store) -> Result<u64, DataError> {
 }
 
 /// Writes `plan.json`, or compares with the one that is there.
-fn agree(store: &Store, plan: &Plan) -> Result<(), DataError> {
-    let name = crate::manifest::PLAN;
+fn agree(store: &Store, plan: &Plan) -> Result<(), BuildError> {
+    let name = PLAN;
     match Plan::load(store)? {
-        None => store.write(name, &to_json(plan, store, name)?),
+        None => Ok(store.write(name, &to_json(plan, store, name)?)?),
         Some(old) if old == *plan => Ok(()),
         Some(old) => {
             let differs = match (old.config == plan.config, old.input == plan.input) {
@@ -213,19 +215,19 @@ fn agree(store: &Store, plan: &Plan) -> Result<(), DataError> {
                 _ => "is made of other objects with another configuration".into(),
             };
             let problem = format!("this folder {differs}: choose another folder, or the same arguments as before");
-            Err(DataError::File { path: store.path(name), problem })
+            Err(DataError::File { path: store.path(name), problem }.into())
         }
     }
 }
 
 /// One thread pool per worker: rayon's threads would otherwise start further objects while they wait within one.
-fn pools(workers: usize) -> Result<Vec<rayon::ThreadPool>, DataError> {
+fn pools(workers: usize) -> Result<Vec<rayon::ThreadPool>, BuildError> {
     let cores = rayon::current_num_threads();
     let workers = if workers == 0 { cores } else { workers.min(1024) };
     (0..workers)
         .map(|_| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads((cores / workers).max(1)).build();
-            pool.map_err(|e| DataError::from(Invalid::new("workers", "threads that the system can start", e)))
+            pool.map_err(|e| BuildError::from(Invalid::new("workers", "threads that the system can start", e)))
         })
         .collect()
 }
@@ -256,7 +258,7 @@ fn split_of(item: &Item, config: &BuildConfig) -> Split {
 }
 
 /// The mesh of an item in the canonical frame.
-pub(crate) fn mesh_of(item: &Item, config: &BuildConfig) -> Result<(Mesh, FileFacts), DataError> {
+pub(crate) fn mesh_of(item: &Item, config: &BuildConfig) -> Result<(Mesh, FileFacts), BuildError> {
     match &item.file {
         None => Ok((generate(seed_of(item, config), &config.object.generator)?, FileFacts::default())),
         Some(path) => {
@@ -268,11 +270,11 @@ pub(crate) fn mesh_of(item: &Item, config: &BuildConfig) -> Result<(Mesh, FileFa
 }
 
 /// The object of an item.
-fn make_item(item: &Item, config: &BuildConfig) -> Result<(Made, FileFacts), DataError> {
+fn make_item(item: &Item, config: &BuildConfig) -> Result<(MadeObject, FileFacts), BuildError> {
     let start = Instant::now();
     let (mesh, facts) = mesh_of(item, config)?;
     let mut read = 0.0;
-    lap(&mut read, start);
+    add_elapsed(&mut read, start);
     let seed = seed_of(item, config);
     let mut made = make(item.id.clone(), mesh, seed, &config.object, &config.depths, config.shard.held_out)?;
     made.seconds.read = read;
@@ -282,8 +284,8 @@ fn make_item(item: &Item, config: &BuildConfig) -> Result<(Made, FileFacts), Dat
 /// The views of an item in the canonical frame, as an object of it would have them, and which of them evaluation uses.
 ///
 /// # Errors
-/// As [`BuildConfig::validate`]; [`DataError::Mesh`] for a mesh that cannot be loaded.
-pub fn render_views(item: &Item, config: &BuildConfig) -> Result<(Vec<View>, Option<ViewSets>), DataError> {
+/// As [`BuildConfig::validate`]; [`BuildError::Mesh`] for a mesh that cannot be loaded.
+pub fn render_views(item: &Item, config: &BuildConfig) -> Result<(Vec<View>, Option<ViewSets>), BuildError> {
     config.validate()?;
     let (mesh, _) = mesh_of(item, config)?;
     let seed = seed_of(item, config);
@@ -293,7 +295,7 @@ pub fn render_views(item: &Item, config: &BuildConfig) -> Result<(Vec<View>, Opt
 }
 
 /// The views that evaluation uses; `None` where there are too few.
-fn evaluation(views: &[View], config: &BuildConfig, seed: u64) -> Result<Option<ViewSets>, DataError> {
+fn evaluation(views: &[View], config: &BuildConfig, seed: u64) -> Result<Option<ViewSets>, BuildError> {
     let selection = SelectionConfig { seed, ..config.shard.selection.clone() };
     if views.len() < 2 * selection.inputs + selection.validation {
         return Ok(None);
@@ -344,6 +346,7 @@ fn unpoisoned<T>(lock: Result<T, PoisonError<T>>) -> T {
 
 struct Work<'a, P, M> {
     plan: &'a Plan,
+    config: &'a BuildConfig,
     plan_sha256: String,
     items: &'a Items,
     store: &'a Store,
@@ -359,18 +362,18 @@ struct Work<'a, P, M> {
 impl<P, M> Work<'_, P, M>
 where
     P: Fn(Done) + Sync,
-    M: Fn(&Item) -> Result<(Made, FileFacts), DataError> + Sync,
+    M: Fn(&Item) -> Result<(MadeObject, FileFacts), BuildError> + Sync,
 {
     /// Makes what is missing of some shards, by all workers. The first error of the store ends it.
     ///
     /// Workers go on with the next shard while others finish the last objects of one; who makes a shard's last object
     /// also joins it.
-    fn shards(&self, shards: Vec<u64>) -> Result<Vec<ShardRecord>, DataError> {
+    fn shards(&self, shards: Vec<u64>) -> Result<Vec<ShardRecord>, BuildError> {
         let queue = Mutex::new(Queue { shards: shards.into(), ..Queue::default() });
         let (records, failed) = (Mutex::new(BTreeMap::new()), Mutex::new(None));
         let stop = AtomicBool::new(false);
         let keep = |record: ShardRecord| unpoisoned(records.lock()).insert(record.index, record);
-        let work = |pool: &rayon::ThreadPool| -> Result<(), DataError> {
+        let work = |pool: &rayon::ThreadPool| -> Result<(), BuildError> {
             while !stop.load(Ordering::Relaxed) {
                 let next = {
                     let mut queue = unpoisoned(queue.lock());
@@ -414,9 +417,9 @@ where
     }
 
     /// What is there of a shard.
-    fn scan(&self, shard: u64) -> Result<Scan, DataError> {
+    fn scan(&self, shard: u64) -> Result<Scan, BuildError> {
         let old = ShardRecord::load(self.store, self.plan, &self.plan_sha256, shard)?;
-        let whole = |r: &ShardRecord| Ok::<_, DataError>(self.store.size(&r.name())? == Some(r.bytes));
+        let whole = |r: &ShardRecord| Ok::<_, BuildError>(self.store.size(&r.name())? == Some(r.bytes));
         if let Some(record) = old
             && whole(&record)?
         {
@@ -445,22 +448,21 @@ where
     }
 
     /// Makes parts of the objects of a finished shard again, so that only those that it lacks have to be made.
-    fn unpack(&self, record: &ShardRecord) -> Result<(), DataError> {
+    fn unpack(&self, record: &ShardRecord) -> Result<(), BuildError> {
         let (folder, name) = (parts(record.index), record.name());
         for &ObjectRecord { index, offset, bytes, split, psnr, flagged, ref id, .. } in &record.objects {
             let bytes = self.store.range(&name, offset, bytes)?;
-            let object =
-                ObjectBytes::new(bytes.clone(), id, self.store.path(&name))?.object(&self.plan.config.depths)?;
-            let statistics = statistics_of(&object, &self.plan.config.depths)?;
+            let object = ObjectBytes::new(bytes.clone(), id, self.store.path(&name))?.object(&self.config.depths)?;
+            let statistics = statistics_of(&object, &self.config.depths)?;
             self.store.write(&format!("{folder}/{}", bytes_name(index)), &bytes)?;
             self.write_outcome(&folder, index, &Outcome::Made { split, psnr, flagged, statistics })?;
         }
         Ok(())
     }
 
-    fn item(&self, index: u64) -> Result<Item, DataError> {
+    fn item(&self, index: u64) -> Result<Item, BuildError> {
         self.items.get(index).ok_or_else(|| {
-            DataError::from(Invalid::new("items", format!("item {index}"), format!("{} items", self.items.len())))
+            BuildError::from(Invalid::new("items", format!("item {index}"), format!("{} items", self.items.len())))
         })
     }
 
@@ -470,7 +472,7 @@ where
     }
 
     /// Makes an object and writes it to `parts/`. Fails only if it cannot be written.
-    fn make_one(&self, shard: u64, index: u64) -> Result<(), DataError> {
+    fn make_one(&self, shard: u64, index: u64) -> Result<(), BuildError> {
         let item = self.item(index)?;
         let folder = parts(shard);
         // Any one of 140,000 files may meet a fault in some library: that is a reason, too, and the rest goes on.
@@ -485,7 +487,7 @@ where
             Ok((bytes, outcome, psnr, mut seconds)) => {
                 self.store.write(&format!("{folder}/{}", bytes_name(index)), &bytes)?;
                 self.write_outcome(&folder, index, &outcome)?;
-                lap(&mut seconds.write, start);
+                add_elapsed(&mut seconds.write, start);
                 let measured = psnr.is_some();
                 let psnr = psnr.unwrap_or_default();
                 {
@@ -511,7 +513,7 @@ where
     /// The bytes of an object and what is to be remembered of it, or why it could not be made.
     #[allow(clippy::type_complexity, reason = "named once, used once")]
     fn encoded(&self, item: &Item, shard: &str) -> Result<(Vec<u8>, Outcome, Option<HeldOutPsnr>, Seconds), String> {
-        let config = &self.plan.config;
+        let config = self.config;
         let (mut made, facts) = (self.make)(item).map_err(|e| chain(&e))?;
         let start = Instant::now();
         let seed = seed_of(item, config);
@@ -535,25 +537,25 @@ where
         let leaves = config.shard.leaves.then_some(&made.leaves);
         let bytes = object_bytes(&made.object, leaves, &metadata, config.shard.images, Path::new(shard));
         let bytes = bytes.map_err(|e| chain(&e))?;
-        lap(&mut made.seconds.write, start);
+        add_elapsed(&mut made.seconds.write, start);
         let psnr = made.psnr.as_ref().map(|p| p.leaves);
         Ok((bytes, Outcome::Made { split: metadata.split, psnr, flagged, statistics }, made.psnr, made.seconds))
     }
 
-    fn write_outcome(&self, folder: &str, index: u64, outcome: &Outcome) -> Result<(), DataError> {
+    fn write_outcome(&self, folder: &str, index: u64, outcome: &Outcome) -> Result<(), BuildError> {
         let name = format!("{folder}/{}", outcome_name(index));
-        self.store.write(&name, &to_json(outcome, self.store, &name)?)
+        Ok(self.store.write(&name, &to_json(outcome, self.store, &name)?)?)
     }
 
-    fn outcome(&self, folder: &str, index: u64) -> Result<Option<Outcome>, DataError> {
+    fn outcome(&self, folder: &str, index: u64) -> Result<Option<Outcome>, BuildError> {
         let name = format!("{folder}/{}", outcome_name(index));
         let Some(bytes) = self.store.read(&name, 1 << 24)? else { return Ok(None) };
         let broken = |e: serde_json::Error| DataError::File { path: self.store.path(&name), problem: e.to_string() };
-        serde_json::from_slice(&bytes).map(Some).map_err(broken)
+        Ok(serde_json::from_slice(&bytes).map(Some).map_err(broken)?)
     }
 
     /// Makes a shard and its record of the parts, which then go away.
-    fn join(&self, shard: u64) -> Result<ShardRecord, DataError> {
+    fn join(&self, shard: u64) -> Result<ShardRecord, BuildError> {
         let (folder, name) = (parts(shard), shard_name(shard));
         let mut record = ShardRecord {
             index: shard,
@@ -561,7 +563,7 @@ where
             bytes: 0,
             sha256: String::new(),
             objects: Vec::new(),
-            statistics: self.plan.config.depths.iter().map(|&d| (d, Statistics::default())).collect(),
+            statistics: self.config.depths.iter().map(|&d| (d, Statistics::default())).collect(),
             failures: Vec::new(),
         };
         let lost = |name: String| DataError::File { path: self.store.path(&name), problem: "it has vanished".into() };
@@ -610,7 +612,7 @@ fn outcome_name(index: u64) -> String {
 }
 
 /// Statistics over an object's slices, by depth.
-fn statistics_of(object: &Object, depths: &[u32]) -> Result<BTreeMap<u32, Statistics>, DataError> {
+fn statistics_of(object: &Object, depths: &[u32]) -> Result<BTreeMap<u32, Statistics>, BuildError> {
     let of_depth = |&depth: &u32| {
         let mut statistics = Statistics::default();
         statistics.add(object.slice(depth)?)?;

@@ -1,16 +1,16 @@
 //! Checks of a configuration before anything is made with it.
 
 use crate::input_fit::MIN_VIEWS;
-use crate::sample::{MAX_DEPTH, MAX_FITS, MAX_SIDE, MAX_VIEWS};
-use crate::{DataError, GaussianSource, ObjectConfig};
+use crate::{BuildError, GaussianSource, ObjectConfig};
 use freerange_core::check;
+use freerange_data::layout::{MAX_DEPTH, MAX_FITS, MAX_SIDE, MAX_VIEWS};
 
 impl ObjectConfig {
     /// Checks every field.
     ///
     /// # Errors
-    /// [`DataError::Config`], [`DataError::Mesh`] or [`DataError::Fit`] with the field's name.
-    pub fn validate(&self) -> Result<(), DataError> {
+    /// [`BuildError::Config`], [`BuildError::Mesh`] or [`BuildError::Fit`] with the field's name.
+    pub fn validate(&self) -> Result<(), BuildError> {
         let views = 1..=MAX_VIEWS;
         check(views.contains(&self.views), "object.views", &format!("1 to {MAX_VIEWS}"), self.views)?;
         let rays = self.samples_per_axis;

@@ -1,12 +1,12 @@
 //! How far the frame is off, before and after a quick fit corrects it: generated objects, seen by four cameras around
 //! them or on one side, moved, turned about the vertical and scaled. Scale as |log|, the centre's distance for a sphere of radius
 //! 0.5; means with 95 % intervals. Scenes, where given, are held to fill that sphere, and not turned.
-//! `cargo run --release -p freerange-data --example frame_accuracy -- OBJECTS [FOLDER_OF_SCENES]`
+//! `cargo run --release -p freerange-build --example frame_accuracy -- OBJECTS [FOLDER_OF_SCENES]`
 
 use std::{ops::ControlFlow, path::Path};
 
+use freerange_build::{ObjectConfig, generate_object};
 use freerange_camera::{FrameConfig, Scene, SelectionConfig, Similarity, View, canonical_from_user, select_views};
-use freerange_data::{Object, ObjectConfig};
 use freerange_fit::{QuickFitConfig, frame_of, quick_fit};
 use glam::{DQuat, DVec3};
 use rand::{Rng, SeedableRng};
@@ -46,7 +46,7 @@ fn main() -> Result<(), Failure> {
 
 fn object(seed: u64, config: &ObjectConfig) -> Result<[Errors; 2], Failure> {
     let mesh = freerange_generate::generate(seed, &config.generator)?;
-    let object = Object::generate(seed, config, &[4])?;
+    let object = generate_object(seed, config, &[4])?;
     let centers: Vec<DVec3> = object.views.iter().map(|v| v.camera.center()).collect();
     let sets = select_views(&centers, DVec3::ZERO, &SelectionConfig::default())?;
     let mut rng = ChaCha8Rng::seed_from_u64(seed);

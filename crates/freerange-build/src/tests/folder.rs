@@ -6,13 +6,15 @@ use super::{
     assert_same, build_toys, contents, message, metadata_of, open, tiny_config, toy, toy_config, toy_items, write_shard,
 };
 use crate::build::{build_with, merge};
-use crate::shard::object_bytes;
 use crate::{
-    BuildConfig, BuildOptions, DataError, GaussianSource, Generated, ImageFormat, Items, Manifest, Object,
-    ObjectSource, ShardConfig, ShardReader, Shards, Share, Split, Store, build, collect, contact_sheet, estimate,
-    inspect,
+    BuildConfig, BuildError, BuildOptions, GaussianSource, Generated, Items, ShardConfig, Share, build, collect,
+    contact_sheet, estimate,
 };
 use freerange_core::Invalid;
+use freerange_data::layout::object_bytes;
+use freerange_data::{
+    DataError, ImageFormat, Manifest, Object, ObjectSource, ShardReader, Shards, Split, Store, inspect,
+};
 
 fn one_of(index: u64, count: u64) -> BuildOptions {
     BuildOptions { share: Share { index, count }, ..BuildOptions::default() }
@@ -267,7 +269,7 @@ fn folders_are_merged_exactly() {
 #[test]
 fn failing_objects_are_recorded_and_the_rest_goes_on() {
     let folder = tempfile::tempdir().unwrap();
-    let broken = |what: &str| DataError::from(Invalid::new(what, "a whole one", "none"));
+    let broken = |what: &str| BuildError::from(Invalid::new(what, "a whole one", "none"));
     let make = |seed| match seed % 4 {
         0 => Err(broken("mesh")),
         1 if seed == 13 => panic!("a bug"),

@@ -8,7 +8,7 @@ use freerange_splat::{Cloud, OPACITY_RANGE, channel};
 use rand::Rng;
 
 use crate::object::Photographed;
-use crate::{DataError, ObjectConfig, SurfaceConfig, surface_gaussians};
+use crate::{BuildError, ObjectConfig, SurfaceConfig, surface_gaussians};
 
 /// Standard deviation along the surface of the Gaussians that a fit starts from, in units of the square root of the area
 /// that each stands for. Wide ones, which overlap, end in better fits and slices than those that look best as they are.
@@ -16,26 +16,32 @@ const START_SPREAD: f32 = 0.8;
 
 /// 3DGS-MCMC on the views. Starts from points on the surface, which a mesh has and a photographed object lacks, wide and
 /// of the opacity `fit.initial_opacity`: faint enough that what is behind them is seen and learns.
-pub(crate) fn fitted_gaussians(shot: &mut Photographed, config: &ObjectConfig) -> Result<Cloud, DataError> {
+pub(crate) fn fitted_gaussians(photographed: &mut Photographed, config: &ObjectConfig) -> Result<Cloud, BuildError> {
     let start = SurfaceConfig {
         points: config.fit.initial.min(config.fit.max_gaussians),
         spread: START_SPREAD,
         opacity: config.fit.initial_opacity as f32,
         ..config.surface.clone()
     };
-    let start = surface_gaussians(&shot.scene, &start, &mut shot.rng);
-    let config = FitConfig { seed: shot.rng.random(), ..config.fit.clone() };
-    Ok(fit(&shot.views, Some(&start), &config, |_| ControlFlow::Continue(()))?)
+    let start = surface_gaussians(&photographed.scene, &start, &mut photographed.rng);
+    let config = FitConfig { seed: photographed.rng.random(), ..config.fit.clone() };
+    Ok(fit(&photographed.views, Some(&start), &config, |_| ControlFlow::Continue(()))?)
 }
 
 /// `slice` after `steps` gradient steps, each towards one of the `views`; its rows stay what and where they are in the
 /// order of the tree. Opacities stay within [`OPACITY_RANGE`].
-pub(crate) fn polished(slice: Cloud, views: &[View], steps: usize, seed: u64) -> Result<Cloud, DataError> {
+pub(crate) fn polished(slice: Cloud, views: &[View], steps: usize, seed: u64) -> Result<Cloud, BuildError> {
     adapted(slice, views, steps, POLISH_RATES, seed)
 }
 
 /// As [`polished`], at these rates.
-pub(crate) fn adapted(slice: Cloud, views: &[View], steps: usize, rates: Rates, seed: u64) -> Result<Cloud, DataError> {
+pub(crate) fn adapted(
+    slice: Cloud,
+    views: &[View],
+    steps: usize,
+    rates: Rates,
+    seed: u64,
+) -> Result<Cloud, BuildError> {
     if steps == 0 {
         return Ok(slice);
     }
@@ -78,14 +84,14 @@ mod tests {
         config.cameras.resolution = 64;
         config.fit = FitConfig { iterations: 60, initial: 512, max_gaussians: 512, ..FitConfig::default() };
         let mesh = freerange_generate::generate(3, &config.generator).unwrap();
-        let mut shot = Photographed::new(mesh, 3, &config, 4, &mut Seconds::default()).unwrap();
-        let leaves = fitted_gaussians(&mut shot, &config).unwrap();
+        let mut photographed = Photographed::new(mesh, 3, &config, 4, &mut Seconds::default()).unwrap();
+        let leaves = fitted_gaussians(&mut photographed, &config).unwrap();
         assert_eq!(leaves.len(), 512);
         let slice = LodTree::build(&leaves, config.alignment).unwrap().slice(6).unwrap();
-        assert_eq!(polished(slice.clone(), &shot.views, 0, 1).unwrap(), slice);
-        let better = polished(slice.clone(), &shot.views, 80, 1).unwrap();
-        assert_eq!(better, polished(slice.clone(), &shot.views, 80, 1).unwrap());
-        let [before, after] = [&slice, &better].map(|c| psnr_over_white(c, &shot.held_out).unwrap());
+        assert_eq!(polished(slice.clone(), &photographed.views, 0, 1).unwrap(), slice);
+        let better = polished(slice.clone(), &photographed.views, 80, 1).unwrap();
+        assert_eq!(better, polished(slice.clone(), &photographed.views, 80, 1).unwrap());
+        let [before, after] = [&slice, &better].map(|c| psnr_over_white(c, &photographed.held_out).unwrap());
         assert!(after > before + 0.5, "{before} dB, then {after} dB");
         for i in 0..slice.len() {
             // Where it was, but for a fraction of its own size.

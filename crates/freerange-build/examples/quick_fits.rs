@@ -1,11 +1,12 @@
 //! What a quick fit of four views is worth, by its settings: PSNR in dB on held-out views of generated objects over
 //! white, of the fit and of its slice of 1,024 Gaussians, and seconds.
-//! `cargo run --release -p freerange-data --example quick_fits -- OBJECTS ITERATIONS GAUSSIANS SIZE [ITERATIONS GAUSSIANS SIZE ...]`
+//! `cargo run --release -p freerange-build --example quick_fits -- OBJECTS ITERATIONS GAUSSIANS SIZE [ITERATIONS GAUSSIANS SIZE ...]`
 
 use std::{ops::ControlFlow, time::Instant};
 
+use freerange_build::{ObjectConfig, generate_object};
 use freerange_camera::{SelectionConfig, View, image_ops::composite, select_views};
-use freerange_data::{Object, ObjectConfig};
+use freerange_data::Object;
 use freerange_fit::{QuickFitConfig, quick_fit, tree_slice};
 use freerange_metrics::psnr;
 use freerange_raster::{RasterConfig, render};
@@ -21,7 +22,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     config.surface.points = 256;
     let objects: Vec<Object> = (0..objects as u64)
         .into_par_iter()
-        .map(|i| Object::generate(7_000_000_002_000 + i, &config, &[4]))
+        .map(|i| generate_object(7_000_000_002_000 + i, &config, &[4]))
         .collect::<Result<_, _>>()?;
     println!(
         "| iterations | Gaussians | px | full: fit | slice | partial: fit | slice | s |\n|---|---|---|---|---|---|---|---|"

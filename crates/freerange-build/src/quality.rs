@@ -13,8 +13,8 @@ use image::RgbaImage;
 use crate::build::{mesh_of, seed_of};
 use crate::fitted::{fitted_gaussians, polished};
 use crate::items::Item;
-use crate::object::{Photographed, Seconds, lap};
-use crate::{BuildConfig, DataError, ObjectConfig, SurfaceConfig, surface_gaussians};
+use crate::object::{Photographed, Seconds, add_elapsed};
+use crate::{BuildConfig, BuildError, ObjectConfig, SurfaceConfig, surface_gaussians};
 
 /// Renders that agree to the last bit would have infinite PSNR; this keeps means finite.
 const BEST_PSNR: f64 = 100.0;
@@ -56,8 +56,8 @@ pub struct CountQuality {
 /// Fits an object with the configured number of Gaussians and with each of `counts`, and compares fits with slices.
 ///
 /// # Errors
-/// [`DataError::Config`] for counts that are no powers of two or exceed the full fit's; what making an object may say.
-pub fn measure_quality(item: &Item, config: &BuildConfig, counts: &[usize]) -> Result<Quality, DataError> {
+/// [`BuildError::Config`] for counts that are no powers of two or exceed the full fit's; what making an object may say.
+pub fn measure_quality(item: &Item, config: &BuildConfig, counts: &[usize]) -> Result<Quality, BuildError> {
     config.validate()?;
     let most = config.object.fit.max_gaussians;
     let fine = |n: &usize| n.is_power_of_two() && *n <= most;
@@ -67,41 +67,44 @@ pub fn measure_quality(item: &Item, config: &BuildConfig, counts: &[usize]) -> R
     let seed = seed_of(item, config);
     let triangles = mesh.triangles.len();
     let object = &config.object;
-    let mut shot = Photographed::new(mesh, seed, object, config.shard.held_out, &mut Seconds::default())?;
+    let mut photographed = Photographed::new(mesh, seed, object, config.shard.held_out, &mut Seconds::default())?;
 
-    let timed = |shot: &mut Photographed, fit: FitConfig| -> Result<(Cloud, f64, f64), DataError> {
+    let timed = |photographed: &mut Photographed, fit: FitConfig| -> Result<(Cloud, f64, f64), BuildError> {
         let start = Instant::now();
-        let cloud = fitted_gaussians(shot, &ObjectConfig { fit, ..object.clone() })?;
+        let cloud = fitted_gaussians(photographed, &ObjectConfig { fit, ..object.clone() })?;
         let mut seconds = 0.0;
-        lap(&mut seconds, start);
-        let db = psnr_over_white(&cloud, &shot.held_out)?;
+        add_elapsed(&mut seconds, start);
+        let db = psnr_over_white(&cloud, &photographed.held_out)?;
         Ok((cloud, db, seconds))
     };
-    let (full_cloud, full, full_seconds) = timed(&mut shot, object.fit.clone())?;
+    let (full_cloud, full, full_seconds) = timed(&mut photographed, object.fit.clone())?;
     let deepest = counts.iter().max().map_or(0, |n| n.ilog2());
     let tree = LodTree::build_to_depth(&full_cloud, deepest, object.alignment)?;
     let points = SurfaceConfig { points: full_cloud.len(), ..object.surface.clone() };
-    let surface = surface_gaussians(&shot.scene, &points, &mut shot.rng);
+    let surface = surface_gaussians(&photographed.scene, &points, &mut photographed.rng);
     let surface = LodTree::build_to_depth(&surface, deepest, object.alignment)?;
     let by_count = counts.iter().map(|&gaussians| {
         let fit =
             FitConfig { max_gaussians: gaussians, initial: object.fit.initial.min(gaussians), ..object.fit.clone() };
-        let (_, fit, fit_seconds) = timed(&mut shot, fit)?;
+        let (_, fit, fit_seconds) = timed(&mut photographed, fit)?;
         let slice = tree.slice(gaussians.ilog2())?;
         let polished = match object.polish {
             0 => None,
-            steps => Some(psnr_over_white(&polished(slice.clone(), &shot.views, steps, seed)?, &shot.held_out)?),
+            steps => Some(psnr_over_white(
+                &polished(slice.clone(), &photographed.views, steps, seed)?,
+                &photographed.held_out,
+            )?),
         };
         Ok(CountQuality {
             gaussians,
             fit,
             fit_seconds,
-            slice: psnr_over_white(&slice, &shot.held_out)?,
+            slice: psnr_over_white(&slice, &photographed.held_out)?,
             polished,
-            surface: psnr_over_white(&surface.slice(gaussians.ilog2())?, &shot.held_out)?,
+            surface: psnr_over_white(&surface.slice(gaussians.ilog2())?, &photographed.held_out)?,
         })
     });
-    let by_count = by_count.collect::<Result<_, DataError>>()?;
+    let by_count = by_count.collect::<Result<_, BuildError>>()?;
     Ok(Quality { id: item.id.clone(), triangles, gaussians: full_cloud.len(), full, full_seconds, by_count })
 }
 
@@ -109,7 +112,7 @@ pub fn measure_quality(item: &Item, config: &BuildConfig, counts: &[usize]) -> R
 ///
 /// # Errors
 /// What the rasteriser refuses.
-pub fn psnr_over_white(cloud: &Cloud, views: &[View]) -> Result<f64, DataError> {
+pub fn psnr_over_white(cloud: &Cloud, views: &[View]) -> Result<f64, BuildError> {
     let mut sum = 0.0;
     for view in views {
         sum += psnr(&render_over_white(cloud, &view.camera)?, &over_white(&view.image))?.min(BEST_PSNR);
@@ -118,7 +121,7 @@ pub fn psnr_over_white(cloud: &Cloud, views: &[View]) -> Result<f64, DataError> 
 }
 
 /// `cloud` in front of white, clamped to 0..1, sRGB-encoded. `[h, w, 3]`
-pub(crate) fn render_over_white(cloud: &Cloud, camera: &Camera) -> Result<Vec<f32>, DataError> {
+pub(crate) fn render_over_white(cloud: &Cloud, camera: &Camera) -> Result<Vec<f32>, BuildError> {
     let image = freerange_raster::render(cloud.rows(), &[*camera], &[[1.0; 3]], &RasterConfig::default())?;
     Ok(image.rgb.into_iter().map(|v| v.clamp(0.0, 1.0)).collect())
 }

@@ -1,13 +1,14 @@
 //! What objects are made of: seeds of the generator, or mesh files.
 
-use std::collections::{BTreeMap, HashSet};
+use std::collections::HashSet;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use freerange_core::{IoError, hex, sha256};
+use freerange_data::{DataError, Input, Split};
 use sha2::{Digest, Sha256};
 
-use crate::{DataError, Split, object::generated_id};
+use crate::object::generated_id;
 
 /// Endings of mesh files that are looked for in a folder.
 const ENDINGS: [&str; 4] = ["glb", "gltf", "obj", "ply"];
@@ -43,35 +44,6 @@ pub struct Items {
 enum Kind {
     Generated { objects: u64, seed: u64 },
     Files(Vec<Item>),
-}
-
-/// What a manifest says of the [`Items`].
-#[derive(Clone, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
-#[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
-pub enum Input {
-    /// Generated objects.
-    Generated {
-        /// Their number.
-        objects: u64,
-        /// Seed of the first; object `i` has `seed + i`.
-        seed: u64,
-    },
-    /// Mesh files.
-    Files {
-        /// Their number.
-        objects: u64,
-        /// SHA-256 over the list of items: ids, sources, licences, splits. Contents are hashed per object.
-        sha256: String,
-    },
-}
-
-impl Input {
-    /// Number of objects.
-    pub fn objects(&self) -> u64 {
-        match self {
-            Self::Generated { objects, .. } | Self::Files { objects, .. } => *objects,
-        }
-    }
 }
 
 /// One line of a list of meshes.
@@ -149,7 +121,7 @@ impl Items {
             let relative = line.path.to_string_lossy().replace('\\', "/");
             let id = match line.id {
                 None => ids.name(&relative),
-                Some(id) if !crate::sample::is_key(&id) => {
+                Some(id) if !freerange_data::layout::is_key(&id) => {
                     return Err(at(format!("id: expected 1 to {MAX_ID} of A-Z a-z 0-9 - _, found {id:?}")));
                 }
                 Some(id) if !ids.0.insert(id.clone()) => {
@@ -270,13 +242,6 @@ pub(crate) fn draw(id: &str, seed: u64, what: &str) -> u64 {
     digest.iter().take(8).fold(0, |sum, &b| sum << 8 | u64::from(b))
 }
 
-/// Counts per licence, for reports.
-pub(crate) fn count(values: impl Iterator<Item = String>) -> BTreeMap<String, u64> {
-    let mut counts = BTreeMap::new();
-    values.for_each(|v| *counts.entry(v).or_default() += 1);
-    counts
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -295,7 +260,7 @@ mod tests {
         assert_eq!(all.len(), 4);
         assert_eq!(all[0].id, "b-c-mug");
         assert_eq!((all[0].source.as_str(), all[0].licence.as_str()), ("shop: b/c/mug.GLB", "CC-BY-4.0"));
-        assert!(all.iter().all(|i| crate::sample::is_key(&i.id)), "{all:?}");
+        assert!(all.iter().all(|i| freerange_data::layout::is_key(&i.id)), "{all:?}");
         assert_eq!(all.iter().map(|i| &i.id).collect::<HashSet<_>>().len(), 4);
         assert_eq!(Items::find(root, "shop: ", "CC-BY-4.0").unwrap(), items);
         assert_eq!(items.get(4), None);

@@ -1,4 +1,4 @@
-//! How fast training objects stream from shards. `cargo bench -p freerange-data --bench stream -- [FOLDER or URL]`.
+//! How fast training objects stream from shards. `cargo bench -p freerange-build --bench stream -- [FOLDER or URL]`.
 //!
 //! Without FOLDER, 64 generated objects of the size that `configs/tiny.toml` trains on (8 views of 96 x 96 pixels, depths 8 and
 //! 10) are built in a temporary one, as WebP and as PNG. A local folder is in the system's cache after the first pass.
@@ -6,10 +6,8 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use freerange_data::{
-    BuildConfig, BuildOptions, ImageFormat, Items, ObjectConfig, ObjectSource, ShardConfig, Shards, Store, Stream,
-    build,
-};
+use freerange_build::{BuildConfig, BuildOptions, Items, ObjectConfig, ShardConfig, build};
+use freerange_data::{ImageFormat, ObjectSource, Shards, Store, Stream};
 use freerange_render::CameraConfig;
 
 #[path = "../../../tools/machine.rs"]
@@ -46,7 +44,7 @@ fn main() {
 }
 
 fn measure(name: &str, store: &Store) {
-    let depths = shards(store, &[]).manifest().plan.config.depths.clone();
+    let depths = shards(store, &[]).manifest().plan.config.depths().to_vec();
     for threads in [1, 2] {
         let source = shards(store, &depths);
         let bytes: u64 = (0..source.len() as u64).map(|i| source.object_size(i)).sum();

@@ -2,6 +2,8 @@
 
 mod folder;
 mod hostile;
+#[cfg(feature = "cloud")]
+mod remote;
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -15,12 +17,10 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::build::{FileFacts, build_with};
-use crate::object::{Made, generated_id};
-use crate::shard::{END, object_bytes};
-use crate::{
-    BuildConfig, BuildOptions, DataError, HeldOutPsnr, ImageFormat, InputFit, Item, Items, Metadata, Object,
-    ObjectConfig, Seconds, ShardConfig, Shards, Split, Store, Summary,
-};
+use crate::object::{MadeObject, generated_id};
+use crate::{BuildConfig, BuildError, BuildOptions, Item, Items, ObjectConfig, Seconds, ShardConfig, Summary};
+use freerange_data::layout::{END, object_bytes};
+use freerange_data::{DataError, HeldOutPsnr, ImageFormat, InputFit, Metadata, Object, Shards, Split, Store};
 
 /// Generated objects at their smallest.
 pub(crate) fn tiny_config() -> ObjectConfig {
@@ -63,19 +63,19 @@ fn toy(seed: u64) -> Object {
 }
 
 /// A toy as a build makes it. Its fit is as bad as `psnr` says.
-pub(crate) fn made(seed: u64, psnr: f64) -> (Made, FileFacts) {
+pub(crate) fn made(seed: u64, psnr: f64) -> (MadeObject, FileFacts) {
     let object = toy(seed);
     let leaves = object.slices[&3].clone();
     let psnr = Some(HeldOutPsnr { leaves: psnr, slices: BTreeMap::from([(2, 20.25), (3, 0.1 + 0.2)]) });
-    (Made { object, leaves, psnr, seconds: Seconds::default() }, FileFacts::default())
+    (MadeObject { object, leaves, psnr, seconds: Seconds::default() }, FileFacts::default())
 }
 
 /// Builds toys in `folder` on one worker; `make` may fail.
 fn build_toys(
     folder: &Path,
     options: &BuildOptions,
-    make: impl Fn(u64) -> Result<f64, DataError> + Sync,
-) -> Result<Summary, DataError> {
+    make: impl Fn(u64) -> Result<f64, BuildError> + Sync,
+) -> Result<Summary, BuildError> {
     let make = |item: &Item| {
         let seed = item.seed.unwrap();
         make(seed).map(|psnr| made(seed, psnr))
@@ -168,7 +168,7 @@ fn contents(folder: &Path) -> BTreeMap<String, Vec<u8>> {
         .collect()
 }
 
-fn message<T>(result: Result<T, DataError>) -> String {
+fn message<T>(result: Result<T, impl std::fmt::Display>) -> String {
     match result {
         Ok(_) => panic!("expected an error"),
         Err(e) => e.to_string(),

@@ -3,33 +3,14 @@
 use std::ops::ControlFlow;
 
 use freerange_camera::{SelectionConfig, View, select_views};
+use freerange_data::InputFit;
 use freerange_fit::{Rates, quick_fit, tree_slice};
-use freerange_splat::Cloud;
 use glam::DVec3;
 use rand::{Rng, SeedableRng, seq::index};
 use rand_chacha::ChaCha8Rng;
 
 use crate::fitted::adapted;
-use crate::{DataError, ObjectConfig};
-
-/// A quick fit of some of an object's views.
-#[derive(Clone, Debug, PartialEq)]
-pub struct InputFit {
-    /// The views it saw, by number.
-    pub views: Vec<usize>,
-    /// Its Gaussians, a power of two of them in the order of their tree.
-    pub gaussians: Cloud,
-    /// The same Gaussians, one by one, after gradient steps towards all views of the object: what the fit should have been.
-    /// Unlike Gaussians that were made otherwise, they differ from it only where the few views were not enough.
-    pub mended: Cloud,
-}
-
-impl InputFit {
-    /// The depth of the tree that its Gaussians are a slice at.
-    pub fn depth(&self) -> u32 {
-        self.gaussians.len().ilog2()
-    }
-}
+use crate::{BuildError, ObjectConfig};
 
 /// Which views a fit sees.
 #[derive(Clone, Copy, Debug)]
@@ -59,7 +40,7 @@ const MEND_RATES: Rates = Rates { mean: 6e-3, scale: 2e-2, rotation: 2e-3, opaci
 pub(crate) const MIN_VIEWS: usize = 13;
 
 /// The fits that `config` asks for. Pure.
-pub(crate) fn input_fits(views: &[View], config: &ObjectConfig, seed: u64) -> Result<Vec<InputFit>, DataError> {
+pub(crate) fn input_fits(views: &[View], config: &ObjectConfig, seed: u64) -> Result<Vec<InputFit>, BuildError> {
     let centers: Vec<DVec3> = views.iter().map(|v| v.camera.center()).collect();
     let depth = config.quick_fit.gaussians.ilog2();
     let one = |number: usize| {
@@ -76,7 +57,7 @@ pub(crate) fn input_fits(views: &[View], config: &ObjectConfig, seed: u64) -> Re
     (0..config.input_fits).map(one).collect()
 }
 
-fn draw_set(centers: &[DVec3], set: (usize, Spread), rng: &mut ChaCha8Rng) -> Result<Vec<usize>, DataError> {
+fn draw_set(centers: &[DVec3], set: (usize, Spread), rng: &mut ChaCha8Rng) -> Result<Vec<usize>, BuildError> {
     let (count, spread) = set;
     let selection = SelectionConfig { inputs: count, validation: 1, restarts: 2, seed: rng.random() };
     Ok(match spread {
@@ -89,22 +70,23 @@ fn draw_set(centers: &[DVec3], set: (usize, Spread), rng: &mut ChaCha8Rng) -> Re
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Object;
+    use crate::generate_object;
     use crate::quality::psnr_over_white;
     use crate::tests::tiny_config;
     use freerange_fit::QuickFitConfig;
+    use freerange_splat::Cloud;
 
     #[test]
     fn fits_come_from_their_views_alone_and_change_nothing_else() {
         let mut config = ObjectConfig { views: MIN_VIEWS, ..tiny_config() };
-        let without = Object::generate(5, &config, &[3]).unwrap();
+        let without = generate_object(5, &config, &[3]).unwrap();
         config.input_fits = 4;
         config.mend = 100;
         config.quick_fit = QuickFitConfig { iterations: 20, gaussians: 64, render_size: 32 };
-        let with = Object::generate(5, &config, &[3]).unwrap();
+        let with = generate_object(5, &config, &[3]).unwrap();
         assert_eq!((&with.slices, &without.slices), (&without.slices, &with.slices));
         assert_eq!(with.input_fits.iter().map(|f| f.views.len()).collect::<Vec<_>>(), [4, 4, 3, 6]);
-        assert_eq!(with.input_fits, Object::generate(5, &config, &[3]).unwrap().input_fits);
+        assert_eq!(with.input_fits, generate_object(5, &config, &[3]).unwrap().input_fits);
         for fit in &with.input_fits {
             let mut views = fit.views.clone();
             views.sort_unstable();
