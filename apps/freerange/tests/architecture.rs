@@ -36,6 +36,7 @@ const ROOMS: &[(&str, &[&str])] = &[
     (
         "freerange-flow",
         &[
+            "freerange-core",
             "freerange-splat",
             "freerange-camera",
             "freerange-raster",

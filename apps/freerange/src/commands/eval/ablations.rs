@@ -134,7 +134,7 @@ impl Args {
 
     /// The variants, and in what they differ from the default.
     fn plan(&self, default: &Options, inputs: usize) -> Result<Vec<(Variant, Different)>, CliError> {
-        let multiples = || [0.25, 0.5, 2.0, 4.0].map(|factor| factor * default.sample.photometric).into();
+        let multiples = || [0.25, 0.5, 2.0, 4.0].map(|factor| factor * default.sample.lambda_pg).into();
         let values = Values {
             steps: self.step_counts.clone(),
             lambda: self.lambdas.clone().unwrap_or_else(multiples),
