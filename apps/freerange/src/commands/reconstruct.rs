@@ -97,7 +97,8 @@ pub struct Sampling {
     /// [default: the checkpoint's].
     #[arg(long, value_parser = parse_solver)]
     pub solver: Option<Solver>,
-    /// Arithmetic of the transformer: f32, or bf16 or f16 where the device has it [default: the checkpoint's].
+    /// Arithmetic of the transformer: f32, bf16 or f16 where the device has it, or auto, the faster of the first two [default:
+    /// the checkpoint's].
     #[arg(long, value_parser = parse_compute)]
     pub compute: Option<Compute>,
     /// Which way is up in the scene's frame: z, y, cameras (where the tops of the photos point), a direction X,Y,Z, or auto:
@@ -123,9 +124,9 @@ fn parse_solver(text: &str) -> Result<Solver, String> {
     serde_json::from_value(text.into()).map_err(|_| "expected euler, heun, multistep or hold".into())
 }
 
-/// `f32`, `bf16` or `f16`.
+/// `f32`, `bf16`, `f16` or `auto`.
 pub fn parse_compute(text: &str) -> Result<Compute, String> {
-    serde_json::from_value(text.into()).map_err(|_| "expected f32, bf16 or f16".into())
+    serde_json::from_value(text.into()).map_err(|_| "expected f32, bf16, f16 or auto".into())
 }
 
 impl Sampling {
