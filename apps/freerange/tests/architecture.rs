@@ -5,18 +5,21 @@ use std::{collections::BTreeMap, fs, path::Path};
 /// Each crate, and which of the others it may use. They stand in the road's order: nobody uses what comes later.
 const ROOMS: &[(&str, &[&str])] = &[
     ("freerange-core", &[]),
-    ("freerange-splat", &[]),
-    ("freerange-camera", &[]),
+    ("freerange-splat", &["freerange-core"]),
+    ("freerange-camera", &["freerange-core"]),
     ("freerange-scene", &["freerange-camera"]),
-    ("freerange-formats", &["freerange-splat"]),
-    ("freerange-hub", &[]),
+    ("freerange-formats", &["freerange-core", "freerange-splat"]),
+    ("freerange-hub", &["freerange-core"]),
     ("freerange-raster", &["freerange-camera"]),
-    ("freerange-model", &["freerange-splat"]),
+    ("freerange-model", &["freerange-core", "freerange-splat"]),
     ("freerange-metrics", &["freerange-model"]),
     ("freerange-mesh", &["freerange-core"]),
     ("freerange-render", &["freerange-core", "freerange-camera", "freerange-mesh"]),
     ("freerange-generate", &["freerange-core", "freerange-mesh"]),
-    ("freerange-fit", &["freerange-splat", "freerange-camera", "freerange-raster", "freerange-metrics"]),
+    (
+        "freerange-fit",
+        &["freerange-core", "freerange-splat", "freerange-camera", "freerange-raster", "freerange-metrics"],
+    ),
     ("freerange-data", &["freerange-core", "freerange-splat", "freerange-camera"]),
     (
         "freerange-build",

@@ -54,7 +54,8 @@ mod tests {
     #[test]
     fn errors_name_field_and_file() {
         assert_eq!(check(true, "a", "b", 0), Ok(()));
-        let refused = check(f64::NAN > 0.0, "rates.mean", "above 0", f64::NAN).unwrap_err();
+        let rate = f64::NAN;
+        let refused = check(rate > 0.0, "rates.mean", "above 0", rate).unwrap_err();
         assert_eq!(refused.to_string(), "rates.mean: expected above 0, found NaN");
         let path = Path::new("none/there");
         let error = std::fs::read(path).map_err(IoError::at(path)).unwrap_err();

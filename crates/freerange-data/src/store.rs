@@ -334,7 +334,7 @@ impl NewFile {
                 }
                 // The new name, too, must outlive a power cut.
                 if let Some(folder) = self.target.parent().filter(|p| !p.as_os_str().is_empty()) {
-                    freerange_splat::sync_folder(folder).map_err(IoError::at(folder))?;
+                    freerange_core::sync_folder(folder).map_err(IoError::at(folder))?;
                 }
             }
             #[cfg(feature = "cloud")]

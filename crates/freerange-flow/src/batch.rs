@@ -5,7 +5,7 @@ use std::sync::Arc;
 use burn::tensor::{Device, Tensor, TensorData};
 use freerange_camera::{
     PatchLayout, Similarity, View, Window,
-    image_ops::{resize_area, to_f32_rgba},
+    image_ops::{resize_area, shrunk_size, to_f32_rgba},
     plucker,
 };
 use freerange_data::{InputFit, Object};
@@ -25,13 +25,8 @@ use crate::{
 
 /// The same view at most `size` pixels wide and high, aspect kept.
 pub fn shrink(view: &View, size: u32) -> View {
-    let (w, h) = view.image.dimensions();
-    let longest = w.max(h);
-    if longest <= size {
-        return view.clone();
-    }
-    let scaled = |x: u32| ((f64::from(x) * f64::from(size) / f64::from(longest)).round() as u32).max(1);
-    resized(view, scaled(w), scaled(h))
+    let (w, h) = shrunk_size(view.image.dimensions(), size);
+    resized(view, w, h)
 }
 
 /// The views of all objects as squares of one size, at most `size` pixels and at most those of the smallest, to compare

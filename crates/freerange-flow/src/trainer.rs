@@ -13,9 +13,10 @@ use burn::{
     tensor::{Device, Tensor},
 };
 use freerange_build::Generated;
+use freerange_core::{sync_folder, sync_tree};
 use freerange_data::{Object, ObjectSource, Shards, Split, Store, Stream};
 use freerange_model::{Checkpoint, Compute, Dinov2, EncoderConfig, FreeRange, ModelConfig, WeightsOrigin};
-use freerange_splat::{Normalization, Statistics, channel, sync_folder, sync_tree};
+use freerange_splat::{Normalization, Statistics, channel};
 use rand::seq::index::sample as sample_indices;
 
 use crate::{

@@ -3,26 +3,47 @@
 use std::io::{self, BufWriter, Write};
 use std::{fs::File, path::Path};
 
+use tempfile::NamedTempFile;
+
 /// Writes a file beside `path` with `fill`, then renames it to `path`, replacing what is there. Where anything fails,
 /// the process is killed or the power goes, `path` stays as it was. Afterwards the new file outlives both.
 ///
 /// # Errors
 /// Those of `fill` and of the file system.
 pub fn write_atomically(path: &Path, fill: impl FnOnce(&mut BufWriter<&File>) -> io::Result<()>) -> io::Result<()> {
-    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let beside = beside(path)?;
+    let mut writer = BufWriter::new(beside.as_file());
+    fill(&mut writer)?;
+    writer.flush()?;
+    drop(writer);
+    persist(beside, path)
+}
+
+/// A new file in the folder of `path`, to be filled and given that name by [`persist`]. Dropped before, it goes away.
+///
+/// # Errors
+/// Those of the file system.
+pub fn beside(path: &Path) -> io::Result<NamedTempFile> {
     let mut builder = tempfile::Builder::new();
     builder.prefix(".freerange-");
     // Temporary files are private by default; a result has the permissions that any new file gets.
     #[cfg(unix)]
     builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-    let beside = builder.tempfile_in(folder)?;
-    let mut writer = BufWriter::new(beside.as_file());
-    fill(&mut writer)?;
-    writer.flush()?;
-    drop(writer);
-    beside.as_file().sync_all()?;
-    beside.persist(path)?;
-    sync_folder(folder)
+    builder.tempfile_in(folder_of(path))
+}
+
+/// Makes the content of `file` permanent, then its name `path`, replacing what is there.
+///
+/// # Errors
+/// Those of the file system; `path` is then as it was, unless the folder alone could not be made permanent.
+pub fn persist(file: NamedTempFile, path: &Path) -> io::Result<()> {
+    file.as_file().sync_all()?;
+    file.persist(path)?;
+    sync_folder(folder_of(path))
+}
+
+fn folder_of(path: &Path) -> &Path {
+    path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
 /// Waits until the names in `folder` are permanent; those of files that were renamed into it, too, are so only then.

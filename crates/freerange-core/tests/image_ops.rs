@@ -1,6 +1,6 @@
 //! Image helpers against their slow, obvious twins.
 
-use freerange_camera::image_ops::{composite, resize_area, sheet, to_f32_rgba, to_picture};
+use freerange_core::image_ops::{composite, resize_area, sheet, to_f32_rgba, to_picture};
 use image::{Rgba, RgbaImage};
 use proptest::prelude::*;
 
@@ -105,4 +105,12 @@ fn pictures_round_clamp_and_stand_in_rows() {
         assert_eq!(two.get_pixel(x, y), &Rgba([255; 4]), "{x} {y}");
     }
     assert_eq!(sheet(&[]).dimensions(), (1, 1));
+}
+
+#[test]
+fn sizes_shrink_by_the_longest_side() {
+    use freerange_core::image_ops::shrunk_size;
+    assert_eq!(shrunk_size((640, 480), 320), (320, 240));
+    assert_eq!(shrunk_size((480, 640), 640), (480, 640));
+    assert_eq!(shrunk_size((1000, 1), 10), (10, 1));
 }

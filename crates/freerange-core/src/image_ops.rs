@@ -54,6 +54,16 @@ pub fn sheet(rows: &[Vec<RgbaImage>]) -> RgbaImage {
     sheet
 }
 
+/// Width and height with a longest side of at most `longest`, aspect kept; at least 1 pixel each.
+pub fn shrunk_size((width, height): (u32, u32), longest: u32) -> (u32, u32) {
+    let now = width.max(height);
+    if now <= longest {
+        return (width, height);
+    }
+    let shrink = |side: u32| ((f64::from(side) * f64::from(longest) / f64::from(now)).round() as u32).max(1);
+    (shrink(width), shrink(height))
+}
+
 /// One output sample along an axis: the first input sample it takes, and the weights of those from there on.
 struct Tap {
     first: usize,
