@@ -43,13 +43,13 @@ pub enum DataError {
         /// The shard.
         shard: PathBuf,
         /// Key of the object.
-        sample: String,
+        sample: Box<str>,
         /// The entry, without the key.
-        entry: String,
+        entry: Box<str>,
         /// What would be accepted.
-        expected: String,
+        expected: Box<str>,
         /// What is there.
-        found: String,
+        found: Box<str>,
     },
     /// A thread that makes objects ended early.
     #[error("the thread that makes object {index} has died")]

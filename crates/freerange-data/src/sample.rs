@@ -113,8 +113,8 @@ impl EntryOfShard<'_> {
             shard: self.shard.into(),
             sample: self.sample.into(),
             entry: self.entry.into(),
-            expected: expected.into(),
-            found: found.to_string(),
+            expected: Into::<String>::into(expected).into(),
+            found: found.to_string().into(),
         }
     }
 }
