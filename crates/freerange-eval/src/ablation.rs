@@ -311,7 +311,7 @@ mod tests {
         let default = json!({ "steps": 50, "cfg_scale": 1.5, "lambda_pg": 500.0 });
         let of = |folder: &str| all.iter().find(|v| v.folder == folder).unwrap().apply(&default);
         assert_eq!(of("steps-5"), json!({ "steps": 5, "cfg_scale": 1.5, "lambda_pg": 500.0 }));
-        assert_eq!(of("no-guidance"), json!({ "steps": 50, "guidance": 1.0, "photometric": 0.0 }));
+        assert_eq!(of("no-guidance"), json!({ "steps": 50, "cfg_scale": 1.0, "lambda_pg": 0.0 }));
         assert_eq!(of("inputs-9"), default);
         assert_eq!(of("solver-heun-5")["solver"], "heun");
         assert_eq!(variants(&[Set::Scale], &values()).len(), 1);
