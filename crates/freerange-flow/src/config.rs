@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use freerange_data::{BuildConfig, LoadLimits, ObjectConfig, ShardConfig};
+use freerange_build::{BuildConfig, LoadLimits, ObjectConfig, ShardConfig};
 use freerange_model::{Compute, ModelConfig};
 
 use crate::{

@@ -110,10 +110,10 @@ pub struct Sampling {
     #[arg(long, value_parser = clap::value_parser!(u32).range(4..=16))]
     pub depth: Option<u32>,
     /// Classifier-free guidance scale s; 1 is none [default: the checkpoint's].
-    #[arg(long)]
+    #[arg(long = "cfg-scale", alias = "guidance")]
     pub guidance: Option<f32>,
     /// Photometric guidance scale lambda; 0 is none [default: the checkpoint's].
-    #[arg(long)]
+    #[arg(long = "lambda-pg", alias = "photometric")]
     pub photometric: Option<f32>,
     /// How the steps are taken: euler, heun (two evaluations per step), multistep, or hold (only estimates are fed back)
     /// [default: the checkpoint's].
@@ -182,8 +182,8 @@ impl Sampling {
             Some(StartName::Fit) => Some(sample.start.take().unwrap_or_default()),
             None => sample.start.take(),
         };
-        sample.guidance = self.guidance.unwrap_or(sample.guidance);
-        sample.photometric = self.photometric.unwrap_or(sample.photometric);
+        sample.cfg_scale = self.guidance.unwrap_or(sample.cfg_scale);
+        sample.lambda_pg = self.photometric.unwrap_or(sample.lambda_pg);
         sample.solver = self.solver.unwrap_or(sample.solver);
         sample.compute = self.compute.unwrap_or(sample.compute);
         sample.refine = self.refine.unwrap_or(sample.refine);

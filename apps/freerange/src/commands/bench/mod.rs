@@ -79,7 +79,7 @@ impl std::fmt::Display for Part {
 }
 
 #[derive(Serialize)]
-struct Report {
+struct BenchReport {
     device: String,
     hardware: String,
     commit: String,
@@ -94,7 +94,6 @@ struct Report {
     train: Vec<whole::Train>,
 }
 
-/// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
     let device = args.device.open()?;
     let listed = devices().into_iter().find(|d| d.is(&device));
@@ -108,7 +107,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         true => vec!["tiny".into()],
     };
     let timer = timer::Timer { device: device.clone(), seconds: args.seconds };
-    let mut report = Report {
+    let mut report = BenchReport {
         device: name,
         hardware,
         commit: runtime::commit(),
