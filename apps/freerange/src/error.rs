@@ -2,6 +2,7 @@
 
 use std::{error::Error, fmt, io, path::Path};
 
+use freerange_build::BuildError;
 use freerange_data::DataError;
 use freerange_fit::FitError;
 use freerange_flow::FlowError;
@@ -95,6 +96,7 @@ impl From<FlowError> for CliError {
     fn from(e: FlowError) -> Self {
         match e {
             FlowError::Data(e) => e.into(),
+            FlowError::Build(e) => e.into(),
             FlowError::NotFinite { .. } | FlowError::NoGradient | FlowError::Cancelled => Self::failure(e),
             _ => Self { code: code_of(&e), source: e.into() },
         }
@@ -116,8 +118,21 @@ impl From<freerange::Error> for CliError {
 impl From<DataError> for CliError {
     fn from(e: DataError) -> Self {
         match e {
-            DataError::Fit(e) => e.into(),
             DataError::Worker { .. } => Self::failure(e),
+            DataError::Source(e) => match e.downcast::<BuildError>() {
+                Ok(e) => (*e).into(),
+                Err(e) => Self { code: code_of(&*e), source: e },
+            },
+            _ => Self { code: code_of(&e), source: e.into() },
+        }
+    }
+}
+
+impl From<BuildError> for CliError {
+    fn from(e: BuildError) -> Self {
+        match e {
+            BuildError::Data(e) => e.into(),
+            BuildError::Fit(e) => e.into(),
             _ => Self { code: code_of(&e), source: e.into() },
         }
     }
@@ -157,10 +172,12 @@ other_errors!(
 
 #[cfg(test)]
 mod tests {
+    use freerange_core::IoError;
+
     use super::*;
 
     fn data(kind: io::ErrorKind) -> DataError {
-        DataError::Io { path: "shards/a.tar".into(), source: kind.into() }
+        DataError::Io(IoError { path: "shards/a.tar".into(), source: kind.into() })
     }
 
     #[test]
@@ -179,7 +196,7 @@ mod tests {
             CliError::file(Path::new("a"), io::Error::from(io::ErrorKind::StorageFull)),
             CliError::file(Path::new("a"), image::ImageError::IoError(io::ErrorKind::StorageFull.into())),
             diverged().into(),
-            FlowError::Data(DataError::Fit(diverged())).into(),
+            FlowError::Data(DataError::from_source(BuildError::Fit(diverged()))).into(),
             DataError::Worker { index: 1 }.into(),
             FlowError::NoGradient.into(),
         ];

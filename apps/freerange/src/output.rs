@@ -6,7 +6,7 @@ use std::{
     path::{Component, Path, PathBuf},
 };
 
-use freerange_splat::write_atomically;
+use freerange_core::write_atomically;
 
 use crate::error::CliError;
 

@@ -1,13 +1,16 @@
 //! Options that say how photos are read, and the scene that comes of them.
 
-use std::{path::Path, str::FromStr};
+use std::{
+    path::{Path, PathBuf},
+    str::FromStr,
+};
 
 use freerange::{FrameConfig, Up};
 use freerange_scene::{
-    LoadConfig, Loaded, MaskSource,
+    LoadConfig, Loaded, MaskModel, MaskSource, PixelRange,
     estimate::Hints,
-    load,
-    read::{Cameras, Format, Turntable, cameras},
+    files, load,
+    read::{Cameras, Format, ReadConfig, Turntable, cameras, cameras_with},
     up_of,
 };
 use glam::DVec3;
@@ -25,10 +28,20 @@ pub struct Photos {
     /// add `,cw` for the other way.
     #[arg(long, value_name = "ELEVATION,FOV", conflicts_with = "cameras", allow_hyphen_values = true)]
     turntable: Option<Turntable>,
+    /// The folder of the photos, where they lie apart from the cameras (COLMAP, Polycam, Metashape, RealityCapture).
+    #[arg(long, value_name = "FOLDER")]
+    images: Option<PathBuf>,
     /// Where the object's masks come from: a folder of them (NAME.png, white is the object), alpha, plain (one colour behind the object),
     /// or estimate (from poses and colours) [default: the first of these that is there; folders are called masks].
     #[arg(long, value_name = "WHERE", value_parser = parse_masks)]
     masks: Option<MaskSource>,
+    /// Masks from a segmentation network, an ONNX file such as u2netp.onnx: one input (1 x 3 x height x width), the first output is the
+    /// mask. Needs a program built with --features mask-model.
+    #[arg(long, value_name = "FILE", conflicts_with = "masks")]
+    mask_model: Option<PathBuf>,
+    /// What the network takes for pixels: imagenet (mean and deviation), unit (0 to 1), centered (-0.5 to 0.5), signed (-1 to 1).
+    #[arg(long, value_name = "RANGE", default_value = "imagenet", requires = "mask_model", value_parser = parse_range)]
+    mask_model_pixels: PixelRange,
     /// In mask files black is the object.
     #[arg(long)]
     invert_masks: bool,
@@ -95,6 +108,11 @@ fn parse_masks(text: &str) -> Result<MaskSource, String> {
     })
 }
 
+fn parse_range(text: &str) -> Result<PixelRange, String> {
+    let known = PixelRange::ALL.into_iter().find(|(name, _)| *name == text);
+    known.map(|(_, range)| range).ok_or_else(|| "expected imagenet, unit, centered or signed".into())
+}
+
 fn parse_point(text: &str) -> Result<DVec3, String> {
     let numbers: Vec<f64> =
         text.split(',').filter_map(|p| p.trim().parse().ok()).filter(|v: &f64| v.is_finite()).collect();
@@ -117,16 +135,60 @@ pub struct Scene {
 }
 
 impl Photos {
-    /// Reads a scene.
-    pub fn load(&self, scene: &Path, up: UpChoice) -> Result<Scene, CliError> {
-        let cameras = cameras(scene, self.cameras, self.turntable.as_ref())?;
-        let config = LoadConfig {
-            masks: self.masks.clone().unwrap_or_default(),
+    /// Reads the cameras of a scene.
+    pub fn cameras(&self, scene: &Path) -> Result<Cameras, CliError> {
+        let Self { cameras: format, turntable, images, .. } = self;
+        Ok(cameras_with(scene, &ReadConfig { format: *format, turntable: *turntable, images: images.clone() })?)
+    }
+
+    fn config(&self) -> LoadConfig {
+        let masks = match &self.mask_model {
+            Some(file) => MaskSource::Model(MaskModel { file: file.clone(), pixels: self.mask_model_pixels }),
+            None => self.masks.clone().unwrap_or_default(),
+        };
+        LoadConfig {
+            masks,
             invert_masks: self.invert_masks,
             max_side: self.max_side,
             hints: Hints { center: self.center, radius: self.radius },
-        };
-        let loaded = load(&cameras, &config)?;
+        }
+    }
+
+    /// The files that a scene is read from.
+    pub fn files(&self, cameras: &Cameras) -> Result<Vec<PathBuf>, CliError> {
+        Ok(files(cameras, &self.config())?)
+    }
+
+    /// Name and value of every option.
+    pub fn told(&self) -> Vec<(String, String)> {
+        let Self {
+            cameras,
+            turntable,
+            images,
+            masks,
+            mask_model,
+            mask_model_pixels,
+            invert_masks,
+            max_side,
+            center,
+            radius,
+        } = self;
+        vec![
+            ("mask-model".into(), format!("{mask_model:?}, {mask_model_pixels:?}")),
+            ("cameras".into(), format!("{:?}", cameras.map(Format::name))),
+            ("turntable".into(), format!("{turntable:?}")),
+            ("images".into(), format!("{images:?}")),
+            ("masks".into(), format!("{masks:?}")),
+            ("invert-masks".into(), invert_masks.to_string()),
+            ("max-side".into(), max_side.to_string()),
+            ("center".into(), format!("{center:?}")),
+            ("radius".into(), format!("{radius:?}")),
+        ]
+    }
+
+    /// Reads a scene.
+    pub fn load(&self, cameras: Cameras, up: UpChoice) -> Result<Scene, CliError> {
+        let loaded = load(&cameras, &self.config())?;
         let mut notes: Vec<String> = cameras.notes.iter().chain(&loaded.notes).cloned().collect();
         let up = match up {
             UpChoice::Told(up) => up,

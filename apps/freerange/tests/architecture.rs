@@ -4,37 +4,51 @@ use std::{collections::BTreeMap, fs, path::Path};
 
 /// Each crate, and which of the others it may use. They stand in the road's order: nobody uses what comes later.
 const ROOMS: &[(&str, &[&str])] = &[
-    ("freerange-splat", &[]),
-    ("freerange-camera", &[]),
+    ("freerange-core", &[]),
+    ("freerange-splat", &["freerange-core"]),
+    ("freerange-camera", &["freerange-core"]),
     ("freerange-scene", &["freerange-camera"]),
-    ("freerange-formats", &["freerange-splat"]),
+    ("freerange-formats", &["freerange-core", "freerange-splat"]),
     ("freerange-serve", &["freerange-splat", "freerange-camera", "freerange-scene", "freerange-formats"]),
-    ("freerange-hub", &[]),
+    ("freerange-hub", &["freerange-core"]),
     ("freerange-raster", &["freerange-camera"]),
-    ("freerange-model", &["freerange-splat"]),
+    ("freerange-model", &["freerange-core", "freerange-splat"]),
     ("freerange-metrics", &["freerange-model"]),
-    ("freerange-mesh", &["freerange-camera"]),
-    ("freerange-fit", &["freerange-splat", "freerange-camera", "freerange-raster", "freerange-metrics"]),
+    ("freerange-mesh", &["freerange-core"]),
+    ("freerange-render", &["freerange-core", "freerange-camera", "freerange-mesh"]),
+    ("freerange-generate", &["freerange-core", "freerange-mesh"]),
     (
-        "freerange-data",
+        "freerange-fit",
+        &["freerange-core", "freerange-splat", "freerange-camera", "freerange-raster", "freerange-metrics"],
+    ),
+    ("freerange-data", &["freerange-core", "freerange-splat", "freerange-camera"]),
+    (
+        "freerange-build",
         &[
+            "freerange-core",
             "freerange-splat",
             "freerange-camera",
             "freerange-raster",
             "freerange-metrics",
             "freerange-mesh",
+            "freerange-render",
+            "freerange-generate",
             "freerange-fit",
+            "freerange-data",
         ],
     ),
     (
         "freerange-flow",
         &[
+            "freerange-core",
             "freerange-splat",
             "freerange-camera",
             "freerange-raster",
             "freerange-model",
             "freerange-fit",
             "freerange-data",
+            // For objects made on the fly.
+            "freerange-build",
         ],
     ),
     (
@@ -49,7 +63,10 @@ const ROOMS: &[(&str, &[&str])] = &[
             "freerange-flow",
         ],
     ),
-    ("freerange-eval", &["freerange-splat", "freerange-camera", "freerange-raster", "freerange-metrics"]),
+    (
+        "freerange-eval",
+        &["freerange-core", "freerange-splat", "freerange-camera", "freerange-raster", "freerange-metrics"],
+    ),
     ("freerange-cli", &["*"]),
 ];
 

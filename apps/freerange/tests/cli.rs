@@ -244,8 +244,8 @@ fn a_ply_with_a_lying_element_count() {
 #[test]
 fn bad_numbers_on_the_command_line() {
     let s = scene();
-    refused(s.path(), &["--guidance", "nan"], &["guidance"]);
-    refused(s.path(), &["--photometric=-1"], &["photometric"]);
+    refused(s.path(), &["--cfg-scale", "nan"], &["cfg_scale"]);
+    refused(s.path(), &["--photometric=-1"], &["lambda_pg"]);
     refused(Path::new("no/such/scene"), &[], &["no/such/scene"]);
     let done = freerange(&["train", "tiny", "-o", "no/such/run", "--save-every", "0"]);
     let message = String::from_utf8_lossy(&done.stderr).into_owned();

@@ -69,11 +69,11 @@ fn root() -> PathBuf {
 }
 
 /// A folder with the encoder `encoder`, `other` of the same architecture, and configurations.
-struct Place {
+struct RunFolder {
     folder: tempfile::TempDir,
 }
 
-impl Place {
+impl RunFolder {
     fn new() -> Self {
         let folder = tempfile::tempdir().unwrap();
         let golden = root().join("tests/golden/dino/mlp_img56");
@@ -163,7 +163,7 @@ fn sha256(encoder: &str) -> String {
 
 #[test]
 fn a_model_with_an_outside_encoder_goes_the_whole_road() {
-    let place = Place::new();
+    let place = RunFolder::new();
     let config = place.config("config.toml", "weights = \"encoder\"");
     let (whole, halves) = (place.path("whole"), place.path("halves"));
     let sha = sha256(&place.path("encoder"));
@@ -190,6 +190,7 @@ fn a_model_with_an_outside_encoder_goes_the_whole_road() {
     let checkpoint = Path::new(&whole).join("checkpoint.safetensors").to_str().unwrap().to_owned();
     let expected = place.reconstruct(&checkpoint, "out", &[]);
     place.says(0, &["model", "info", &checkpoint], &[&sha, &place.path("encoder"), "found in"]);
+    place.says(0, &["model", "info", &checkpoint, "--json"], &["\"encoder_weights\"", &sha, &place.path("encoder")]);
     fs::rename(place.path("encoder"), place.path("moved")).unwrap();
     place.refused(&checkpoint, &[], &[&place.path("encoder"), "config.json", "--encoder-weights"]);
     place.says(0, &["model", "info", &checkpoint], &[&sha, "not found"]);
@@ -210,7 +211,7 @@ fn a_model_with_an_outside_encoder_goes_the_whole_road() {
 
 #[test]
 fn the_hubs_weights_are_those_in_the_cache() {
-    let place = Place::new();
+    let place = RunFolder::new();
     let config = place.config("config.toml", "weights = \"hf:someone/tiny-encoder\"");
     let run = place.path("run");
     place.says(
@@ -230,7 +231,7 @@ fn the_hubs_weights_are_those_in_the_cache() {
 
 #[test]
 fn a_frozen_encoder_without_weights_is_for_dry_runs_alone() {
-    let place = Place::new();
+    let place = RunFolder::new();
     let run = place.path("run");
     let config = place.config("none.toml", "");
     place.says(2, &["train", &config, "-o", &run], &["model.encoder.weights", "random = true"]);

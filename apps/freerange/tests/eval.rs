@@ -254,7 +254,7 @@ fn bad_input_is_refused_with_exit_code_2() {
     refused(&["--scenes", &dir, "-o", &out, "--metrics", "psnr,beauty"], &["beauty", "psnr"]);
     refused(&["--scenes", &dir, "-o", &out, "--limit", "0"], &["nothing to evaluate"]);
     refused(&["--scenes", &dir, "-o", &out, "--share", "2/2"], &["I/N"]);
-    refused(&["--scenes", &dir, "-o", &out, "--guidance", "nan"], &["guidance"]);
+    refused(&["--scenes", &dir, "-o", &out, "--guidance", "nan"], &["cfg_scale"]);
     refused(&["compare", &dir, &dir], &["report.json"]);
     // A folder that holds something else is left alone.
     let message = expect(2, &["eval", "--scenes", &dir, "--method", "white", "-o", &dir, "--restart"]);
@@ -473,8 +473,8 @@ fn ablations_change_one_setting_at_a_time_and_can_be_resumed() {
     assert_eq!(line("inputs-2")["comparisons"][0]["inputs"], serde_json::json!([4, 2]));
     assert!(study["without"][0]["name"].as_str().unwrap().contains('9'), "{}", study["without"]);
     let settings = |folder: &str| report(&text(Path::new(&out).join(folder)))["settings"]["method"]["sample"].clone();
-    assert_eq!(settings("no-classifier-free")["guidance"], 1.0);
-    assert_eq!(settings("no-classifier-free")["photometric"], settings("default")["photometric"]);
+    assert_eq!(settings("no-classifier-free")["cfg_scale"], 1.0);
+    assert_eq!(settings("no-classifier-free")["lambda_pg"], settings("default")["lambda_pg"]);
     assert_eq!(settings("steps-2")["steps"], 2);
     let tables = fs::read_to_string(Path::new(&out).join("ablations.md")).unwrap();
     assert!(tables.contains("31.30") && tables.contains("28.22") && tables.contains("[2 steps](steps-2/report.html)"));

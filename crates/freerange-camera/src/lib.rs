@@ -5,7 +5,6 @@
 mod camera;
 mod error;
 mod frame;
-pub mod image_ops;
 mod lens;
 mod plucker;
 pub mod scene;
@@ -14,7 +13,10 @@ mod square;
 
 pub use camera::{Camera, View};
 pub use error::{CameraError, Place};
-pub use frame::{CANONICAL_RADIUS, CanonicalFrame, FrameConfig, Similarity, Up, canonical_from_user, outline_radius};
+pub use frame::{
+    CANONICAL_RADIUS, CanonicalFrame, FrameConfig, Similarity, Up, cameras_up, canonical_from_user, outline_radius,
+};
+pub use freerange_core::image_ops;
 pub use lens::Lens;
 pub use plucker::{PatchLayout, plucker};
 pub use scene::{Scene, load_cameras, transforms_json};

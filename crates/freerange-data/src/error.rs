@@ -1,5 +1,7 @@
 use std::path::PathBuf;
 
+use freerange_core::{Invalid, IoError};
+
 /// What can go wrong with training data.
 #[derive(Debug, thiserror::Error)]
 pub enum DataError {
@@ -14,15 +16,8 @@ pub enum DataError {
         found: Vec<u32>,
     },
     /// A configuration field has an impossible value.
-    #[error("{field}: expected {expected}, found {found}")]
-    Config {
-        /// The field.
-        field: String,
-        /// What it may be.
-        expected: String,
-        /// What it is.
-        found: String,
-    },
+    #[error(transparent)]
+    Config(#[from] Invalid),
     /// A file or folder is not what it should be.
     #[error("{}: {problem}", path.display())]
     File {
@@ -32,13 +27,8 @@ pub enum DataError {
         problem: String,
     },
     /// Reading or writing failed.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// The reason.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    Io(#[from] IoError),
     /// A place for shards that cannot be used.
     #[error("{location}: {problem}")]
     Store {
@@ -53,13 +43,13 @@ pub enum DataError {
         /// The shard.
         shard: PathBuf,
         /// Key of the object.
-        sample: String,
+        sample: Box<str>,
         /// The entry, without the key.
-        entry: String,
+        entry: Box<str>,
         /// What would be accepted.
-        expected: String,
+        expected: Box<str>,
         /// What is there.
-        found: String,
+        found: Box<str>,
     },
     /// A thread that makes objects ended early.
     #[error("the thread that makes object {index} has died")]
@@ -77,22 +67,20 @@ pub enum DataError {
         /// What was wrong with the last one.
         last: Box<DataError>,
     },
-    /// The choice of views.
+    /// A source other than shards has no object for a number.
+    #[error(transparent)]
+    Source(Box<dyn std::error::Error + Send + Sync>),
+    /// The cameras.
     #[error(transparent)]
     Camera(#[from] freerange_camera::CameraError),
     /// The Gaussians or their tree.
     #[error(transparent)]
     Splat(#[from] freerange_splat::SplatError),
-    /// The mesh or its renderer.
-    #[error(transparent)]
-    Mesh(#[from] freerange_mesh::MeshError),
-    /// The rasteriser.
-    #[error(transparent)]
-    Raster(#[from] freerange_raster::RasterError),
-    /// The measures of image quality.
-    #[error(transparent)]
-    Metrics(#[from] freerange_metrics::MetricsError),
-    /// The fit.
-    #[error(transparent)]
-    Fit(#[from] freerange_fit::FitError),
+}
+
+impl DataError {
+    /// The error of a source of its own kind.
+    pub fn from_source(error: impl std::error::Error + Send + Sync + 'static) -> Self {
+        Self::Source(Box::new(error))
+    }
 }

@@ -1,20 +1,14 @@
-//! Training objects: how one is made of a mesh or a seed, and how many are made, stored and streamed.
+//! Training objects: what one is, how many are stored and streamed.
 //!
 //! An object is its posed views and its Gaussians at the depths of the level-of-detail tree that training needs.
-//! Making one is a pure function of (mesh, configuration, seed); [`build()`] makes many and writes them as shards,
-//! [`Shards`] reads those as a stream, [`Generated`] makes objects on the fly.
+//! [`Shards`] reads a folder of them as a stream. How objects are made is `freerange-build`'s; here, a folder only says
+//! so ([`Recipe`]).
 
-mod build;
-mod config;
 mod error;
-mod estimate;
-mod fitted;
-mod input_fit;
 mod inspect;
-mod items;
+pub mod layout;
 mod manifest;
 mod object;
-mod quality;
 #[cfg(feature = "cloud")]
 mod remote;
 mod sample;
@@ -22,25 +16,13 @@ mod shard;
 mod shards;
 mod store;
 mod stream;
-mod surface;
-#[cfg(test)]
-mod tests;
-mod validate;
 
-pub use build::{BuildOptions, Done, Share, Summary, build, collect, merge, render_views};
-pub use config::{BuildConfig, ImageFormat, ShardConfig, Split};
 pub use error::DataError;
-pub use estimate::{Estimate, estimate};
-pub use freerange_mesh::LoadLimits;
-pub use input_fit::InputFit;
-pub use inspect::{Report, contact_sheet, inspect};
-pub use items::{Input, Item, Items};
-pub use manifest::{FORMAT, Failure, Manifest, ObjectRecord, Plan, ShardRecord};
-pub use object::{GaussianSource, HeldOutPsnr, Object, ObjectConfig, Seconds};
-pub use quality::{CountQuality, Quality, measure_quality, psnr_over_white};
+pub use inspect::{Inspection, inspect};
+pub use manifest::{FORMAT, Failure, Input, Manifest, ObjectRecord, Plan, Recipe, ShardRecord};
+pub use object::{HeldOutPsnr, ImageFormat, InputFit, Object, Split};
 pub use sample::Metadata;
 pub use shard::ShardReader;
 pub use shards::Shards;
-pub use store::Store;
-pub use stream::{Generated, ObjectSource, Stream};
-pub use surface::{SurfaceConfig, surface_gaussians};
+pub use store::{NewFile, Store};
+pub use stream::{ObjectSource, Stream};

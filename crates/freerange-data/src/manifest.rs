@@ -12,22 +12,24 @@ use std::collections::{BTreeMap, HashSet};
 use std::ops::Range;
 use std::path::Path;
 
+use freerange_core::{Invalid, check, sha256};
 use freerange_splat::Statistics;
+use serde_json::value::RawValue;
 
-use crate::items::Input;
-use crate::sample::is_key;
-use crate::store::{Store, sha256};
-use crate::{BuildConfig, DataError, Split};
+use crate::sample::{MAX_DEPTH, is_key};
+use crate::store::Store;
+use crate::{DataError, Split};
 
 /// Version of the layout of shards and manifest.
 pub const FORMAT: u32 = 2;
 /// Largest manifest, in bytes.
 const MAX_BYTES: u64 = 1 << 30;
 /// Largest number of objects.
-pub(crate) const MAX_OBJECTS: u64 = 1 << 32;
+pub const MAX_OBJECTS: u64 = 1 << 32;
 
 pub(crate) const MANIFEST: &str = "manifest.json";
-pub(crate) const PLAN: &str = "plan.json";
+/// File name of the plan.
+pub const PLAN: &str = "plan.json";
 
 /// What a folder of shards is made with.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
@@ -36,7 +38,7 @@ pub struct Plan {
     /// [`FORMAT`].
     pub format: u32,
     /// How objects are made and stored.
-    pub config: BuildConfig,
+    pub config: Recipe,
     /// What they are made of.
     pub input: Input,
 }
@@ -47,11 +49,8 @@ impl Plan {
     /// # Errors
     /// [`DataError::Config`] for values that JSON cannot hold.
     pub fn sha256(&self) -> Result<String, DataError> {
-        let json = serde_json::to_vec(self).map_err(|e| DataError::Config {
-            field: "config".into(),
-            expected: "values JSON can hold".into(),
-            found: e.to_string(),
-        })?;
+        let json =
+            serde_json::to_vec(self).map_err(|e| DataError::from(Invalid::new("config", "values JSON can hold", e)))?;
         Ok(sha256(&json))
     }
 
@@ -61,18 +60,18 @@ impl Plan {
     /// [`DataError::Config`] and those of its parts.
     pub fn validate(&self) -> Result<(), DataError> {
         let objects = self.input.objects();
-        crate::validate::check((1..=MAX_OBJECTS).contains(&objects), "objects", "1 to 2^32", objects)?;
-        self.config.validate()
+        check((1..=MAX_OBJECTS).contains(&objects), "objects", "1 to 2^32", objects)?;
+        Ok(self.config.validate()?)
     }
 
     /// Number of shards.
     pub fn shard_count(&self) -> u64 {
-        self.input.objects().div_ceil(self.config.shard.objects_per_shard)
+        self.input.objects().div_ceil(self.config.objects_per_shard())
     }
 
     /// Numbers of the objects of a shard.
     pub fn shard_objects(&self, shard: u64) -> Range<u64> {
-        let per = self.config.shard.objects_per_shard;
+        let per = self.config.objects_per_shard();
         let first = shard * per;
         first..(first + per).min(self.input.objects())
     }
@@ -83,6 +82,116 @@ impl Plan {
     /// [`DataError::Io`], [`DataError::File`].
     pub fn load(store: &Store) -> Result<Option<Self>, DataError> {
         store.read(PLAN, MAX_BYTES)?.map(|bytes| parse(&store.path(PLAN), &bytes)).transpose()
+    }
+}
+
+/// How the objects of a folder are made and stored: the configuration of who made them, word for word, of which a reader
+/// needs little.
+#[derive(Clone, Debug)]
+pub struct Recipe {
+    json: Box<RawValue>,
+    read: ReadOfRecipe,
+}
+
+/// Fields that reading needs.
+#[derive(Clone, Debug, serde::Deserialize)]
+struct ReadOfRecipe {
+    seed: u64,
+    depths: Vec<u32>,
+    shard: ReadOfShard,
+}
+
+#[derive(Clone, Debug, serde::Deserialize)]
+struct ReadOfShard {
+    objects_per_shard: u64,
+}
+
+impl Recipe {
+    /// That of a configuration with the fields `seed`, `depths` and `shard.objects_per_shard`.
+    ///
+    /// # Errors
+    /// [`DataError::Config`] for values that JSON cannot hold, and where one of these is missing.
+    pub fn new(config: &impl serde::Serialize) -> Result<Self, DataError> {
+        let json = serde_json::value::to_raw_value(config);
+        let recipe = json.and_then(|json| serde_json::from_str(json.get()));
+        recipe.map_err(|e| Invalid::new("config", "values JSON can hold", e).into())
+    }
+
+    /// Seed of what is drawn for the objects.
+    pub fn seed(&self) -> u64 {
+        self.read.seed
+    }
+
+    /// Depths of the slices, ascending.
+    pub fn depths(&self) -> &[u32] {
+        &self.read.depths
+    }
+
+    /// Objects per shard; the last one may have fewer.
+    pub fn objects_per_shard(&self) -> u64 {
+        self.read.shard.objects_per_shard
+    }
+
+    /// Checks what reading needs.
+    ///
+    /// # Errors
+    /// [`Invalid`] with the field's name.
+    pub fn validate(&self) -> Result<(), Invalid> {
+        let depths = self.depths();
+        let ascending = depths.is_sorted_by(|a, b| a < b) && depths.iter().all(|d| *d <= MAX_DEPTH);
+        let expected = format!("one or more ascending depths up to {MAX_DEPTH}");
+        check(ascending && !depths.is_empty(), "depths", &expected, depths)?;
+        let per = self.objects_per_shard();
+        check((1..=1 << 20).contains(&per), "objects_per_shard", "1 to 2^20", per)
+    }
+}
+
+impl PartialEq for Recipe {
+    fn eq(&self, other: &Self) -> bool {
+        self.json.get() == other.json.get()
+    }
+}
+
+impl serde::Serialize for Recipe {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        self.json.serialize(serializer)
+    }
+}
+
+impl<'de> serde::Deserialize<'de> for Recipe {
+    fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let json = Box::<RawValue>::deserialize(deserializer)?;
+        let read = serde_json::from_str(json.get()).map_err(serde::de::Error::custom)?;
+        Ok(Self { json, read })
+    }
+}
+
+/// What objects are made of.
+#[derive(Clone, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
+pub enum Input {
+    /// Generated objects.
+    Generated {
+        /// Their number.
+        objects: u64,
+        /// Seed of the first; object `i` has `seed + i`.
+        seed: u64,
+    },
+    /// Mesh files.
+    Files {
+        /// Their number.
+        objects: u64,
+        /// SHA-256 over the list of items: ids, sources, licences, splits. Contents are hashed per object.
+        sha256: String,
+    },
+}
+
+impl Input {
+    /// Number of objects.
+    pub fn objects(&self) -> u64 {
+        match self {
+            Self::Generated { objects, .. } | Self::Files { objects, .. } => *objects,
+        }
     }
 }
 
@@ -153,12 +262,12 @@ pub struct Failure {
 }
 
 /// File name of a shard.
-pub(crate) fn shard_name(index: u64) -> String {
+pub fn shard_name(index: u64) -> String {
     format!("shard-{index:05}.tar")
 }
 
 /// File name of a shard's record.
-pub(crate) fn record_name(index: u64) -> String {
+pub fn record_name(index: u64) -> String {
     format!("shard-{index:05}.json")
 }
 
@@ -172,7 +281,7 @@ impl ShardRecord {
     ///
     /// # Errors
     /// [`DataError::Io`], [`DataError::File`].
-    pub(crate) fn load(store: &Store, plan: &Plan, plan_sha256: &str, index: u64) -> Result<Option<Self>, DataError> {
+    pub fn load(store: &Store, plan: &Plan, plan_sha256: &str, index: u64) -> Result<Option<Self>, DataError> {
         let name = record_name(index);
         let Some(bytes) = store.read(&name, MAX_BYTES)? else { return Ok(None) };
         let problem = |problem: String| DataError::File { path: store.path(&name), problem };
@@ -202,8 +311,8 @@ impl ShardRecord {
             expect(inside, "objects.offset", format!("from {end}, within {} bytes", self.bytes), span())?;
             end = o.offset + o.bytes;
         }
-        let known = plan.config.depths.iter().eq(self.statistics.keys());
-        expect(known, "statistics", format!("{:?}", plan.config.depths), format!("{:?}", self.statistics.keys()))?;
+        let known = plan.config.depths().iter().eq(self.statistics.keys());
+        expect(known, "statistics", format!("{:?}", plan.config.depths()), format!("{:?}", self.statistics.keys()))?;
         let counted = self.objects.iter().filter(|o| o.is_for_training()).count() as u64;
         for (depth, statistics) in &self.statistics {
             // No overflow: neither number exceeds what `validate` allows.
@@ -300,7 +409,10 @@ impl Manifest {
     }
 
     /// Writes `manifest.json` in one piece.
-    pub(crate) fn save(&self, store: &Store) -> Result<(), DataError> {
+    ///
+    /// # Errors
+    /// [`DataError::Io`].
+    pub fn save(&self, store: &Store) -> Result<(), DataError> {
         store.write(MANIFEST, &to_json(self, store, MANIFEST)?)
     }
 
@@ -326,12 +438,15 @@ impl Manifest {
         for shard in &self.shards {
             all.merge(shard.statistics.get(&depth)?);
         }
-        self.plan.config.depths.contains(&depth).then_some(all)
+        self.plan.config.depths().contains(&depth).then_some(all)
     }
 }
 
-/// `value` as JSON with a line break at its end.
-pub(crate) fn to_json(value: &impl serde::Serialize, store: &Store, name: &str) -> Result<Vec<u8>, DataError> {
+/// `value` as JSON with a line break at its end. Messages call it `name` of `store`.
+///
+/// # Errors
+/// [`DataError::File`] for values that JSON cannot hold.
+pub fn to_json(value: &impl serde::Serialize, store: &Store, name: &str) -> Result<Vec<u8>, DataError> {
     let problem = |e: serde_json::Error| DataError::File { path: store.path(name), problem: e.to_string() };
     let mut json = serde_json::to_vec(value).map_err(problem)?;
     json.push(b'\n');

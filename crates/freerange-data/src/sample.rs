@@ -27,15 +27,15 @@ pub(crate) const CAMERAS: &str = "cameras.json";
 pub(crate) const GAUSSIANS: &str = "gaussians.safetensors";
 
 /// Largest number of views of an object.
-pub(crate) const MAX_VIEWS: usize = 1000;
+pub const MAX_VIEWS: usize = 1000;
 /// Largest side of a view, in pixels.
-pub(crate) const MAX_SIDE: u32 = 8192;
+pub const MAX_SIDE: u32 = 8192;
 /// Pixels that the views of an object may have together: 1 GiB decoded.
 const MAX_PIXELS: u64 = 1 << 28;
 /// Most quick fits of an object.
-pub(crate) const MAX_FITS: usize = 64;
+pub const MAX_FITS: usize = 64;
 /// Deepest slice.
-pub(crate) const MAX_DEPTH: u32 = 22;
+pub const MAX_DEPTH: u32 = 22;
 
 /// What is known of an object besides its views and Gaussians.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
@@ -96,16 +96,16 @@ struct Posed {
 
 /// Where in a folder of shards something was found.
 #[derive(Clone, Copy)]
-pub(crate) struct Place<'a> {
+pub(crate) struct EntryOfShard<'a> {
     pub shard: &'a Path,
     pub sample: &'a str,
     pub entry: &'a str,
 }
 
-impl Place<'_> {
+impl EntryOfShard<'_> {
     /// Another entry of the same object.
-    pub fn of<'a>(&'a self, entry: &'a str) -> Place<'a> {
-        Place { entry, ..*self }
+    pub fn of<'a>(&'a self, entry: &'a str) -> EntryOfShard<'a> {
+        EntryOfShard { entry, ..*self }
     }
 
     pub fn error(&self, expected: impl Into<String>, found: impl ToString) -> DataError {
@@ -113,8 +113,8 @@ impl Place<'_> {
             shard: self.shard.into(),
             sample: self.sample.into(),
             entry: self.entry.into(),
-            expected: expected.into(),
-            found: found.to_string(),
+            expected: Into::<String>::into(expected).into(),
+            found: found.to_string().into(),
         }
     }
 }
@@ -137,20 +137,23 @@ fn tensor_name(depth: u32) -> String {
 }
 
 /// Whether `key` can name an object: up to 64 of `A-Z a-z 0-9 - _`.
-pub(crate) fn is_key(key: &str) -> bool {
+pub fn is_key(key: &str) -> bool {
     (1..=64).contains(&key.len()) && key.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'-' || b == b'_')
 }
 
 /// The entries of an object in the order of a shard: what follows `KEY.` in the name, and the bytes.
-/// `shard` is for messages only. Refuses whatever [`Shards`](crate::Shards) would refuse to read.
-pub(crate) fn encode(
+/// `shard` is for messages only.
+///
+/// # Errors
+/// [`DataError::Sample`] for whatever [`Shards`](crate::Shards) would refuse to read.
+pub fn encode(
     object: &Object,
     leaves: Option<&Cloud>,
     metadata: &Metadata,
     format: ImageFormat,
     shard: &Path,
 ) -> Result<Vec<(String, Vec<u8>)>, DataError> {
-    let place = Place { shard, sample: &object.id, entry: METADATA };
+    let place = EntryOfShard { shard, sample: &object.id, entry: METADATA };
     if !is_key(&object.id) || metadata.id != object.id {
         return Err(place.error("an id of 1 to 64 characters A-Z a-z 0-9 - _", format!("{:?}", metadata.id)));
     }
@@ -192,7 +195,7 @@ pub(crate) fn encode(
     Ok(entries)
 }
 
-fn encode_gaussians(object: &Object, leaves: Option<&Cloud>, place: Place) -> Result<Vec<u8>, DataError> {
+fn encode_gaussians(object: &Object, leaves: Option<&Cloud>, place: EntryOfShard) -> Result<Vec<u8>, DataError> {
     let bytes_of = |cloud: &Cloud| -> Vec<u8> { cloud.rows().iter().flat_map(|v| v.to_le_bytes()).collect() };
     let mut tensors = Vec::with_capacity(object.slices.len() + 1);
     for (&depth, cloud) in &object.slices {
@@ -225,7 +228,7 @@ fn encode_gaussians(object: &Object, leaves: Option<&Cloud>, place: Place) -> Re
 }
 
 /// `KEY.json`.
-pub(crate) fn decode_metadata(bytes: &[u8], place: Place) -> Result<Metadata, DataError> {
+pub(crate) fn decode_metadata(bytes: &[u8], place: EntryOfShard) -> Result<Metadata, DataError> {
     let metadata: Metadata = serde_json::from_slice(bytes).map_err(|e| place.error("the object's metadata", e))?;
     if metadata.id != place.sample {
         return Err(place.error(format!("id {:?}", place.sample), format!("{:?}", metadata.id)));
@@ -234,7 +237,11 @@ pub(crate) fn decode_metadata(bytes: &[u8], place: Place) -> Result<Metadata, Da
 }
 
 /// `KEY.cameras.json`: names and cameras of `count` views.
-pub(crate) fn decode_cameras(bytes: &[u8], count: usize, place: Place) -> Result<Vec<(String, Camera)>, DataError> {
+pub(crate) fn decode_cameras(
+    bytes: &[u8],
+    count: usize,
+    place: EntryOfShard,
+) -> Result<Vec<(String, Camera)>, DataError> {
     let cameras: Cameras = serde_json::from_slice(bytes).map_err(|e| place.error("the cameras of the views", e))?;
     if cameras.convention != CONVENTION {
         return Err(place.error(format!("convention {CONVENTION:?}"), format!("{:?}", cameras.convention)));
@@ -255,7 +262,7 @@ pub(crate) fn decode_cameras(bytes: &[u8], count: usize, place: Place) -> Result
     Ok(names.into_iter().zip(cameras).collect())
 }
 
-fn check_cameras(cameras: &[Camera], place: Place) -> Result<(), DataError> {
+fn check_cameras(cameras: &[Camera], place: EntryOfShard) -> Result<(), DataError> {
     if !(1..=MAX_VIEWS).contains(&cameras.len()) {
         return Err(place.error(format!("1 to {MAX_VIEWS} views"), cameras.len()));
     }
@@ -295,7 +302,7 @@ pub(crate) fn decode_view(
     format: ImageFormat,
     name: String,
     camera: Camera,
-    place: Place,
+    place: EntryOfShard,
 ) -> Result<View, DataError> {
     let reader = Cursor::new(bytes);
     let image = match format {
@@ -309,7 +316,7 @@ fn pixels(
     decoder: ImageResult<impl ImageDecoder>,
     camera: &Camera,
     kind: &str,
-    place: Place,
+    place: EntryOfShard,
 ) -> Result<RgbaImage, DataError> {
     let broken = |e| place.error(kind, e);
     let decoder = decoder.map_err(broken)?;
@@ -324,7 +331,11 @@ fn pixels(
 }
 
 /// Of `KEY.gaussians.safetensors` the slices at `depths`.
-pub(crate) fn decode_slices(bytes: &[u8], depths: &[u32], place: Place) -> Result<BTreeMap<u32, Cloud>, DataError> {
+pub(crate) fn decode_slices(
+    bytes: &[u8],
+    depths: &[u32],
+    place: EntryOfShard,
+) -> Result<BTreeMap<u32, Cloud>, DataError> {
     let tensors = SafeTensors::deserialize(bytes).map_err(|e| place.error("a safetensors file", e))?;
     depths
         .iter()
@@ -342,7 +353,7 @@ pub(crate) fn decode_slices(bytes: &[u8], depths: &[u32], place: Place) -> Resul
 }
 
 /// Of `KEY.gaussians.safetensors` the Gaussians before the tree, where they are kept.
-pub(crate) fn decode_leaves(bytes: &[u8], place: Place) -> Result<Option<Cloud>, DataError> {
+pub(crate) fn decode_leaves(bytes: &[u8], place: EntryOfShard) -> Result<Option<Cloud>, DataError> {
     let tensors = SafeTensors::deserialize(bytes).map_err(|e| place.error("a safetensors file", e))?;
     tensors.tensor(LEAVES).ok().map(|tensor| cloud(&tensor, LEAVES, None, place)).transpose()
 }
@@ -352,7 +363,7 @@ pub(crate) fn decode_fits(
     bytes: &[u8],
     views: &[Vec<usize>],
     count: usize,
-    place: Place,
+    place: EntryOfShard,
 ) -> Result<Vec<InputFit>, DataError> {
     if views.len() > MAX_FITS {
         return Err(place.of(METADATA).error(format!("at most {MAX_FITS} input_fits"), views.len()));
@@ -373,7 +384,7 @@ pub(crate) fn decode_fits(
 }
 
 /// A tensor `[rows, 14]` of finite f16; where no number of rows is given, any power of two.
-fn half_cloud(tensors: &SafeTensors, name: &str, rows: Option<usize>, place: Place) -> Result<Cloud, DataError> {
+fn half_cloud(tensors: &SafeTensors, name: &str, rows: Option<usize>, place: EntryOfShard) -> Result<Cloud, DataError> {
     let tensor = tensors.tensor(name).map_err(|_| place.error(format!("tensor {name}"), "none"))?;
     let fits = matches!(tensor.shape(), &[n, channel::COUNT]
         if rows.map_or(n.is_power_of_two() && n <= 1 << MAX_DEPTH, |rows| rows == n));
@@ -389,7 +400,7 @@ fn half_cloud(tensors: &SafeTensors, name: &str, rows: Option<usize>, place: Pla
 }
 
 /// A tensor `[rows, 14]` of finite f32; any number of rows where none is given.
-fn cloud(tensor: &TensorView, name: &str, rows: Option<usize>, place: Place) -> Result<Cloud, DataError> {
+fn cloud(tensor: &TensorView, name: &str, rows: Option<usize>, place: EntryOfShard) -> Result<Cloud, DataError> {
     let fits = matches!(tensor.shape(), &[n, channel::COUNT] if rows.is_none_or(|rows| rows == n));
     if tensor.dtype() != Dtype::F32 || !fits {
         let found = format!("{:?} {:?}", tensor.dtype(), tensor.shape());

@@ -7,10 +7,10 @@ use std::fs::File;
 use std::io::{BufReader, Cursor, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
+use freerange_core::IoError;
 use freerange_splat::Cloud;
 
-use crate::sample::{self, CAMERAS, GAUSSIANS, MAX_VIEWS, METADATA, Metadata, Place};
-use crate::store::io_error;
+use crate::sample::{self, CAMERAS, EntryOfShard, GAUSSIANS, MAX_VIEWS, METADATA, Metadata};
 use crate::{DataError, ImageFormat, Object};
 
 /// Largest entry, in bytes: bounds what a reader allocates.
@@ -20,13 +20,13 @@ const MAX_SAMPLES: usize = 1 << 20;
 /// Tar files consist of blocks of this many bytes.
 const BLOCK: u64 = 512;
 /// What ends a tar file: two zero blocks.
-pub(crate) const END: [u8; 2 * BLOCK as usize] = [0; 2 * BLOCK as usize];
+pub const END: [u8; 2 * BLOCK as usize] = [0; 2 * BLOCK as usize];
 
 /// The entries of one object as they stand in a shard: a tar file without its end.
 ///
 /// # Errors
 /// [`DataError::Sample`] for an object that could not be read back.
-pub(crate) fn object_bytes(
+pub fn object_bytes(
     object: &Object,
     leaves: Option<&Cloud>,
     metadata: &Metadata,
@@ -37,7 +37,10 @@ pub(crate) fn object_bytes(
 }
 
 /// Entries `KEY.NAME` as a tar file without its end.
-pub(crate) fn tar_bytes(key: &str, entries: &[(String, Vec<u8>)], shard: &Path) -> Result<Vec<u8>, DataError> {
+///
+/// # Errors
+/// [`DataError::Io`] for a name that no tar file can hold.
+pub fn tar_bytes(key: &str, entries: &[(String, Vec<u8>)], shard: &Path) -> Result<Vec<u8>, DataError> {
     let mut bytes = Vec::new();
     for (entry, content) in entries {
         let mut header = tar::Header::new_ustar();
@@ -47,7 +50,7 @@ pub(crate) fn tar_bytes(key: &str, entries: &[(String, Vec<u8>)], shard: &Path) 
         header.set_gid(0);
         header.set_mtime(0);
         header.set_size(content.len() as u64);
-        header.set_path(format!("{key}.{entry}")).map_err(io_error(shard))?;
+        header.set_path(format!("{key}.{entry}")).map_err(IoError::at(shard))?;
         header.set_cksum();
         bytes.extend_from_slice(header.as_bytes());
         bytes.extend_from_slice(content);
@@ -75,7 +78,7 @@ struct Sample {
 
 impl Sample {
     fn object(&self, path: &Path, depths: &[u32], mut fetch: impl Fetch) -> Result<Object, DataError> {
-        let place = Place { shard: path, sample: &self.key, entry: METADATA };
+        let place = EntryOfShard { shard: path, sample: &self.key, entry: METADATA };
         let cameras = fetch(self.cameras)?;
         let cameras = sample::decode_cameras(&cameras, self.views.len(), place.of(CAMERAS))?;
         let gaussians = fetch(self.gaussians)?;
@@ -91,12 +94,12 @@ impl Sample {
     }
 
     fn metadata(&self, path: &Path, mut fetch: impl Fetch) -> Result<Metadata, DataError> {
-        let place = Place { shard: path, sample: &self.key, entry: METADATA };
+        let place = EntryOfShard { shard: path, sample: &self.key, entry: METADATA };
         sample::decode_metadata(&fetch(self.metadata)?, place)
     }
 
     fn leaves(&self, path: &Path, mut fetch: impl Fetch) -> Result<Option<Cloud>, DataError> {
-        let place = Place { shard: path, sample: &self.key, entry: GAUSSIANS };
+        let place = EntryOfShard { shard: path, sample: &self.key, entry: GAUSSIANS };
         sample::decode_leaves(&fetch(self.gaussians)?, place)
     }
 }
@@ -106,7 +109,7 @@ trait Fetch: FnMut(Span) -> Result<Vec<u8>, DataError> {}
 impl<F: FnMut(Span) -> Result<Vec<u8>, DataError>> Fetch for F {}
 
 /// The entries of one object, read as a whole.
-pub(crate) struct ObjectBytes {
+pub struct ObjectBytes {
     path: PathBuf,
     bytes: Vec<u8>,
     sample: Sample,
@@ -114,6 +117,9 @@ pub(crate) struct ObjectBytes {
 
 impl ObjectBytes {
     /// `bytes`: those of the object `key` in the shard `path`, which only messages name.
+    ///
+    /// # Errors
+    /// [`DataError::File`] where they are not.
     pub fn new(bytes: Vec<u8>, key: &str, path: PathBuf) -> Result<Self, DataError> {
         let samples = index(Cursor::new(&bytes), bytes.len() as u64, &path, false)?;
         let found = samples.iter().map(|s| s.key.as_ref()).collect::<Vec<_>>().join(", ");
@@ -131,14 +137,26 @@ impl ObjectBytes {
         |s: Span| Ok(self.bytes[s.offset as usize..(s.offset + s.size) as usize].to_vec())
     }
 
+    /// The object, with its slices at `depths`.
+    ///
+    /// # Errors
+    /// [`DataError::Sample`] for a broken entry.
     pub fn object(&self, depths: &[u32]) -> Result<Object, DataError> {
         self.sample.object(&self.path, depths, self.fetch())
     }
 
+    /// What is known of it besides its views and Gaussians.
+    ///
+    /// # Errors
+    /// [`DataError::Sample`] for a broken entry.
     pub fn metadata(&self) -> Result<Metadata, DataError> {
         self.sample.metadata(&self.path, self.fetch())
     }
 
+    /// The Gaussians before the tree, where they are kept.
+    ///
+    /// # Errors
+    /// [`DataError::Sample`] for a broken entry.
     pub fn leaves(&self) -> Result<Option<Cloud>, DataError> {
         self.sample.leaves(&self.path, self.fetch())
     }
@@ -157,8 +175,8 @@ impl ShardReader {
     /// # Errors
     /// [`DataError::Sample`] or [`DataError::File`] where the file is no whole shard; [`DataError::Io`].
     pub fn open(path: &Path) -> Result<Self, DataError> {
-        let file = File::open(path).map_err(io_error(path))?;
-        let length = file.metadata().map_err(io_error(path))?.len();
+        let file = File::open(path).map_err(IoError::at(path))?;
+        let length = file.metadata().map_err(IoError::at(path))?.len();
         Ok(Self { path: path.into(), bytes: None, samples: index(BufReader::new(file), length, path, true)? })
     }
 
@@ -222,7 +240,7 @@ impl ShardReader {
 
     fn fetch(&self) -> Result<impl Fetch + '_, DataError> {
         let mut file = match self.bytes {
-            None => Some(File::open(&self.path).map_err(io_error(&self.path))?),
+            None => Some(File::open(&self.path).map_err(IoError::at(&self.path))?),
             Some(_) => None,
         };
         Ok(move |span: Span| {
@@ -234,7 +252,7 @@ impl ShardReader {
             let mut bytes = vec![0; span.size as usize];
             file.seek(SeekFrom::Start(span.offset))
                 .and_then(|_| file.read_exact(&mut bytes))
-                .map_err(io_error(&self.path))?;
+                .map_err(IoError::at(&self.path))?;
             Ok(bytes)
         })
     }
@@ -249,14 +267,14 @@ fn index(reader: impl Read + Seek, length: u64, path: &Path, whole: bool) -> Res
     let mut samples = Vec::new();
     let mut end = 0;
     // Raw: names beyond 100 bytes and the like are not written here, and need memory that the file decides on.
-    for entry in archive.entries_with_seek().map_err(io_error(path))?.raw(true) {
+    for entry in archive.entries_with_seek().map_err(IoError::at(path))?.raw(true) {
         let entry = entry.map_err(|e| problem(format!("not a tar file from byte {end}: {e}")))?;
         let bytes = entry.path_bytes();
         let name = std::str::from_utf8(&bytes).ok().and_then(|n| n.split_once('.')).filter(|(k, _)| sample::is_key(k));
         let Some((key, rest)) = name else {
             return Err(problem(format!("expected entries called KEY.*, found {:?}", String::from_utf8_lossy(&bytes))));
         };
-        let place = Place { shard: path, sample: key, entry: rest };
+        let place = EntryOfShard { shard: path, sample: key, entry: rest };
         if !entry.header().entry_type().is_file() {
             return Err(place.error("a regular file", format!("{:?}", entry.header().entry_type())));
         }
@@ -303,7 +321,7 @@ struct Draft {
 }
 
 impl Draft {
-    fn add(&mut self, name: &str, span: Span, place: Place) -> Result<(), DataError> {
+    fn add(&mut self, name: &str, span: Span, place: EntryOfShard) -> Result<(), DataError> {
         let next = |format| sample::view_entry(self.views.len(), format);
         let is_view = |format| self.format.is_none_or(|f| f == format) && name == next(format);
         if let Some(format) = [ImageFormat::Webp, ImageFormat::Png].into_iter().find(|f| is_view(*f))
@@ -328,7 +346,7 @@ impl Draft {
 
     fn finish(self, shard: &Path) -> Result<Sample, DataError> {
         let need = |span: Option<Span>, entry| {
-            span.ok_or_else(|| Place { shard, sample: &self.key, entry }.error("this entry", "none"))
+            span.ok_or_else(|| EntryOfShard { shard, sample: &self.key, entry }.error("this entry", "none"))
         };
         let (metadata, cameras) = (need(self.metadata, METADATA)?, need(self.cameras, CAMERAS)?);
         let gaussians = need(self.gaussians, GAUSSIANS)?;

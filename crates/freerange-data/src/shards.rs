@@ -32,7 +32,7 @@ impl std::fmt::Debug for Shards {
 }
 
 impl Shards {
-    /// Opens what [`build`](crate::build) made. Objects will have slices at `depths`. Flagged objects are left out.
+    /// Opens what `freerange data build` made. Objects will have slices at `depths`. Flagged objects are left out.
     /// `split`: `None` takes all parts.
     ///
     /// # Errors
@@ -59,7 +59,7 @@ impl Shards {
 
     fn of(manifest: Manifest, store: &Store, depths: &[u32], split: Option<Split>) -> Result<Self, DataError> {
         let problem = |problem: String| DataError::File { path: store.path(""), problem };
-        let found = &manifest.plan.config.depths;
+        let found = manifest.plan.config.depths();
         if let Some(depth) = depths.iter().find(|d| !found.contains(d)) {
             return Err(problem(format!("expected Gaussians at depth {depth}, found depths {found:?}")));
         }
@@ -79,7 +79,7 @@ impl Shards {
             let part = split.map_or("any part".into(), |s| format!("part {s:?}"));
             return Err(problem(format!("expected objects in {part} that are not flagged, found none")));
         }
-        let (seed, orders) = (manifest.plan.config.seed, Mutex::default());
+        let (seed, orders) = (manifest.plan.config.seed(), Mutex::default());
         Ok(Self { store: store.clone(), objects: all, seed, orders, depths: depths.to_vec(), manifest })
     }
 

@@ -6,6 +6,7 @@ use std::fs::File;
 use std::io::{self, BufWriter, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
+use freerange_core::{IoError, hex};
 use sha2::{Digest, Sha256};
 
 use crate::DataError;
@@ -15,22 +16,16 @@ use crate::remote::Whole;
 /// What follows the name of a local file that is being written.
 pub(crate) const PARTIAL: &str = ".partial";
 
-/// Turns an I/O error into one that names `path`.
-pub(crate) fn io_error(path: &Path) -> impl FnOnce(io::Error) -> DataError {
-    let path = path.to_path_buf();
-    move |source| DataError::Io { path, source }
-}
-
 /// A folder of named files. Names are relative, with `/` between their parts.
 #[derive(Clone, Debug)]
 pub struct Store {
-    place: Place,
+    location: Location,
     /// Tells the unfinished files of one writer from those of another.
     writer: String,
 }
 
 #[derive(Clone, Debug)]
-enum Place {
+enum Location {
     Local(PathBuf),
     #[cfg(feature = "cloud")]
     Remote(crate::remote::Remote),
@@ -43,10 +38,10 @@ impl Store {
     /// # Errors
     /// [`DataError::Store`] for a URL that cannot be used, or where this program was built without the feature `cloud`.
     pub fn open(location: &str) -> Result<Self, DataError> {
-        let place = match location.split_once("://") {
-            None => Place::Local(location.into()),
+        let location = match location.split_once("://") {
+            None => Location::Local(location.into()),
             #[cfg(feature = "cloud")]
-            Some(_) => Place::Remote(crate::remote::Remote::open(location)?),
+            Some(_) => Location::Remote(crate::remote::Remote::open(location)?),
             #[cfg(not(feature = "cloud"))]
             Some(_) => {
                 return Err(DataError::Store {
@@ -55,39 +50,40 @@ impl Store {
                 });
             }
         };
-        Ok(Self { place, writer: String::new() })
+        Ok(Self { location, writer: String::new() })
     }
 
     /// The local folder `path`.
     pub fn local(path: &Path) -> Self {
-        Self { place: Place::Local(path.into()), writer: String::new() }
+        Self { location: Location::Local(path.into()), writer: String::new() }
     }
 
-    #[cfg(all(test, feature = "cloud"))]
-    pub(crate) fn remote(remote: crate::remote::Remote) -> Self {
-        Self { place: Place::Remote(remote), writer: String::new() }
+    /// An object store that goes away with its last copy, as those that URLs name in all else: for tests.
+    #[cfg(feature = "cloud")]
+    pub fn in_memory() -> Self {
+        Self { location: Location::Remote(crate::remote::Remote::in_memory()), writer: String::new() }
     }
 
     /// The same place, written to by `writer`: no two may write at once under one name.
-    pub(crate) fn written_by(&self, writer: String) -> Self {
+    pub fn written_by(&self, writer: String) -> Self {
         Self { writer, ..self.clone() }
     }
 
     /// The local folder, if it is one.
     pub fn folder(&self) -> Option<&Path> {
-        match &self.place {
-            Place::Local(folder) => Some(folder),
+        match &self.location {
+            Location::Local(folder) => Some(folder),
             #[cfg(feature = "cloud")]
-            Place::Remote(_) => None,
+            Location::Remote(_) => None,
         }
     }
 
     /// `name` as it is called in messages.
-    pub(crate) fn path(&self, name: &str) -> PathBuf {
-        match &self.place {
-            Place::Local(folder) => folder.join(name),
+    pub fn path(&self, name: &str) -> PathBuf {
+        match &self.location {
+            Location::Local(folder) => folder.join(name),
             #[cfg(feature = "cloud")]
-            Place::Remote(remote) => remote.path(name),
+            Location::Remote(remote) => remote.path(name),
         }
     }
 
@@ -95,22 +91,22 @@ impl Store {
     ///
     /// # Errors
     /// [`DataError::Io`]; [`DataError::File`] for more than `most` bytes.
-    pub(crate) fn read(&self, name: &str, most: u64) -> Result<Option<Vec<u8>>, DataError> {
+    pub fn read(&self, name: &str, most: u64) -> Result<Option<Vec<u8>>, DataError> {
         let path = self.path(name);
         let too_large = || DataError::File { path: path.clone(), problem: format!("expected at most {most} bytes") };
-        match &self.place {
-            Place::Local(_) => {
+        match &self.location {
+            Location::Local(_) => {
                 let file = match File::open(&path) {
                     Ok(file) => file,
                     Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
-                    Err(e) => return Err(io_error(&path)(e)),
+                    Err(e) => return Err(DataError::from(IoError::at(&path)(e))),
                 };
                 let mut bytes = Vec::new();
-                file.take(most.saturating_add(1)).read_to_end(&mut bytes).map_err(io_error(&path))?;
+                file.take(most.saturating_add(1)).read_to_end(&mut bytes).map_err(IoError::at(&path))?;
                 if bytes.len() as u64 > most { Err(too_large()) } else { Ok(Some(bytes)) }
             }
             #[cfg(feature = "cloud")]
-            Place::Remote(remote) => match remote.read(name, most)? {
+            Location::Remote(remote) => match remote.read(name, most)? {
                 Whole::Here(bytes) => Ok(Some(bytes)),
                 Whole::TooLarge => Err(too_large()),
                 Whole::Missing => Ok(None),
@@ -122,9 +118,9 @@ impl Store {
     ///
     /// # Errors
     /// [`DataError::Io`], also where the file ends before.
-    pub(crate) fn range(&self, name: &str, offset: u64, length: u64) -> Result<Vec<u8>, DataError> {
-        match &self.place {
-            Place::Local(folder) => {
+    pub fn range(&self, name: &str, offset: u64, length: u64) -> Result<Vec<u8>, DataError> {
+        match &self.location {
+            Location::Local(folder) => {
                 let path = folder.join(name);
                 let mut bytes = vec![0; length as usize];
                 File::open(&path)
@@ -132,11 +128,11 @@ impl Store {
                         file.seek(SeekFrom::Start(offset))?;
                         file.read_exact(&mut bytes)
                     })
-                    .map_err(io_error(&path))?;
+                    .map_err(IoError::at(&path))?;
                 Ok(bytes)
             }
             #[cfg(feature = "cloud")]
-            Place::Remote(remote) => remote.range(name, offset, length),
+            Location::Remote(remote) => remote.range(name, offset, length),
         }
     }
 
@@ -144,7 +140,7 @@ impl Store {
     ///
     /// # Errors
     /// [`DataError::Io`], also where the file ends before; those of `take`.
-    pub(crate) fn pieces(
+    pub fn pieces(
         &self,
         name: &str,
         length: u64,
@@ -161,15 +157,15 @@ impl Store {
     ///
     /// # Errors
     /// [`DataError::Io`].
-    pub(crate) fn size(&self, name: &str) -> Result<Option<u64>, DataError> {
-        match &self.place {
-            Place::Local(folder) => match std::fs::metadata(folder.join(name)) {
+    pub fn size(&self, name: &str) -> Result<Option<u64>, DataError> {
+        match &self.location {
+            Location::Local(folder) => match std::fs::metadata(folder.join(name)) {
                 Ok(found) => Ok(found.is_file().then_some(found.len())),
                 Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(None),
-                Err(e) => Err(io_error(&folder.join(name))(e)),
+                Err(e) => Err(DataError::from(IoError::at(&folder.join(name))(e))),
             },
             #[cfg(feature = "cloud")]
-            Place::Remote(remote) => remote.size(name),
+            Location::Remote(remote) => remote.size(name),
         }
     }
 
@@ -177,21 +173,21 @@ impl Store {
     ///
     /// # Errors
     /// [`DataError::Io`].
-    pub(crate) fn create(&self, name: &str) -> Result<NewFile, DataError> {
+    pub fn create(&self, name: &str) -> Result<NewFile, DataError> {
         let target = self.path(name);
-        let sink = match &self.place {
-            Place::Local(_) => {
+        let sink = match &self.location {
+            Location::Local(_) => {
                 if let Some(folder) = target.parent() {
-                    std::fs::create_dir_all(folder).map_err(io_error(folder))?;
+                    std::fs::create_dir_all(folder).map_err(IoError::at(folder))?;
                 }
                 let mut partial = target.clone().into_os_string();
                 partial.push(format!("{PARTIAL}{}", self.writer));
                 let partial = PathBuf::from(partial);
-                let file = File::create(&partial).map_err(io_error(&partial))?;
+                let file = File::create(&partial).map_err(IoError::at(&partial))?;
                 Sink::Local { writer: BufWriter::with_capacity(1 << 20, file), partial }
             }
             #[cfg(feature = "cloud")]
-            Place::Remote(remote) => Sink::Remote(remote.create(name)?),
+            Location::Remote(remote) => Sink::Remote(remote.create(name)?),
         };
         Ok(NewFile { target, sink: Some(sink), hash: Sha256::new(), bytes: 0 })
     }
@@ -200,9 +196,9 @@ impl Store {
     ///
     /// # Errors
     /// [`DataError::Io`].
-    pub(crate) fn write(&self, name: &str, bytes: &[u8]) -> Result<(), DataError> {
+    pub fn write(&self, name: &str, bytes: &[u8]) -> Result<(), DataError> {
         let mut file = self.create(name)?;
-        file.write_all(bytes).map_err(io_error(&self.path(name)))?;
+        file.write_all(bytes).map_err(IoError::at(&self.path(name)))?;
         file.finish().map(|_| ())
     }
 
@@ -210,18 +206,18 @@ impl Store {
     ///
     /// # Errors
     /// [`DataError::Io`].
-    pub(crate) fn list(&self, name: &str) -> Result<Vec<String>, DataError> {
-        let mut names = match &self.place {
-            Place::Local(folder) => {
+    pub fn list(&self, name: &str) -> Result<Vec<String>, DataError> {
+        let mut names = match &self.location {
+            Location::Local(folder) => {
                 let path = folder.join(name);
                 let entries = match std::fs::read_dir(&path) {
                     Ok(entries) => entries,
                     Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
-                    Err(e) => return Err(io_error(&path)(e)),
+                    Err(e) => return Err(DataError::from(IoError::at(&path)(e))),
                 };
                 let mut names = Vec::new();
                 for entry in entries {
-                    let entry = entry.map_err(io_error(&path))?;
+                    let entry = entry.map_err(IoError::at(&path))?;
                     if let Ok(found) = entry.file_name().into_string()
                         && !found.contains(PARTIAL)
                         && entry.path().is_file()
@@ -232,7 +228,7 @@ impl Store {
                 names
             }
             #[cfg(feature = "cloud")]
-            Place::Remote(remote) => remote.list(name)?,
+            Location::Remote(remote) => remote.list(name)?,
         };
         names.sort_unstable();
         Ok(names)
@@ -242,14 +238,16 @@ impl Store {
     ///
     /// # Errors
     /// [`DataError::Io`].
-    pub(crate) fn remove_folder(&self, name: &str) -> Result<(), DataError> {
-        match &self.place {
-            Place::Local(folder) => match std::fs::remove_dir_all(folder.join(name)) {
-                Err(e) if e.kind() != io::ErrorKind::NotFound => Err(io_error(&folder.join(name))(e)),
+    pub fn remove_folder(&self, name: &str) -> Result<(), DataError> {
+        match &self.location {
+            Location::Local(folder) => match std::fs::remove_dir_all(folder.join(name)) {
+                Err(e) if e.kind() != io::ErrorKind::NotFound => {
+                    Err(DataError::from(IoError::at(&folder.join(name))(e)))
+                }
                 _ => Ok(()),
             },
             #[cfg(feature = "cloud")]
-            Place::Remote(remote) => remote.remove(name),
+            Location::Remote(remote) => remote.remove(name),
         }
     }
 
@@ -258,35 +256,38 @@ impl Store {
     ///
     /// # Errors
     /// [`DataError::File`] where another process has it; [`DataError::Io`].
-    pub(crate) fn lock(&self) -> Result<Option<File>, DataError> {
+    pub fn lock(&self) -> Result<Option<File>, DataError> {
         let Some(folder) = self.folder() else { return Ok(None) };
-        std::fs::create_dir_all(folder).map_err(io_error(folder))?;
+        std::fs::create_dir_all(folder).map_err(IoError::at(folder))?;
         let path = folder.join(format!(".lock{}", self.writer));
-        let file = File::create(&path).map_err(io_error(&path))?;
+        let file = File::create(&path).map_err(IoError::at(&path))?;
         match file.try_lock() {
             Ok(()) => Ok(Some(file)),
             Err(std::fs::TryLockError::WouldBlock) => Err(DataError::File {
                 path: folder.into(),
                 problem: "another process is making the same shards in this folder".into(),
             }),
-            Err(std::fs::TryLockError::Error(source)) => Err(DataError::Io { path, source }),
+            Err(std::fs::TryLockError::Error(source)) => Err(DataError::from(IoError { path, source })),
         }
     }
 
     /// Removes what a killed process of the same writer left unfinished outside of folders of their own.
-    pub(crate) fn remove_partial_files(&self, folder: &str) -> Result<(), DataError> {
+    ///
+    /// # Errors
+    /// [`DataError::Io`].
+    pub fn remove_partial_files(&self, folder: &str) -> Result<(), DataError> {
         let Some(root) = self.folder() else { return Ok(()) };
         let path = root.join(folder);
         let ending = format!("{PARTIAL}{}", self.writer);
         let entries = match std::fs::read_dir(&path) {
             Ok(entries) => entries,
             Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(()),
-            Err(e) => return Err(io_error(&path)(e)),
+            Err(e) => return Err(DataError::from(IoError::at(&path)(e))),
         };
         for entry in entries {
-            let found = entry.map_err(io_error(&path))?.path();
+            let found = entry.map_err(IoError::at(&path))?.path();
             if found.file_name().and_then(|n| n.to_str()).is_some_and(|n| n.ends_with(&ending)) {
-                std::fs::remove_file(&found).map_err(io_error(&found))?;
+                std::fs::remove_file(&found).map_err(IoError::at(&found))?;
             }
         }
         Ok(())
@@ -294,7 +295,7 @@ impl Store {
 }
 
 /// A file under construction. Dropped unfinished, it goes away; killed, a local one stays as `*.partial*`.
-pub(crate) struct NewFile {
+pub struct NewFile {
     target: PathBuf,
     sink: Option<Sink>, // none once closed
     hash: Sha256,
@@ -317,6 +318,9 @@ impl NewFile {
     }
 
     /// Makes the bytes permanent, then gives the file its name. Returns its size and SHA-256.
+    ///
+    /// # Errors
+    /// [`DataError::Io`]; no file has the name then.
     pub fn finish(mut self) -> Result<(u64, String), DataError> {
         match self.sink.take() {
             None => {}
@@ -326,15 +330,15 @@ impl NewFile {
                 if let Err(source) = done.and_then(|()| std::fs::rename(&partial, &self.target)) {
                     // The error that counts is the first one.
                     let _ = std::fs::remove_file(&partial);
-                    return Err(io_error(&self.target)(source));
+                    return Err(DataError::from(IoError::at(&self.target)(source)));
                 }
                 // The new name, too, must outlive a power cut.
                 if let Some(folder) = self.target.parent().filter(|p| !p.as_os_str().is_empty()) {
-                    freerange_splat::sync_folder(folder).map_err(io_error(folder))?;
+                    freerange_core::sync_folder(folder).map_err(IoError::at(folder))?;
                 }
             }
             #[cfg(feature = "cloud")]
-            Some(Sink::Remote(upload)) => upload.finish().map_err(io_error(&self.target))?,
+            Some(Sink::Remote(upload)) => upload.finish().map_err(IoError::at(&self.target))?,
         }
         Ok((self.bytes, hex(&std::mem::take(&mut self.hash).finalize())))
     }
@@ -369,15 +373,6 @@ impl Drop for NewFile {
     }
 }
 
-/// SHA-256 of `bytes`, in hexadecimal.
-pub(crate) fn sha256(bytes: &[u8]) -> String {
-    hex(&Sha256::digest(bytes))
-}
-
-pub(crate) fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|b| format!("{b:02x}")).collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -398,7 +393,6 @@ mod tests {
         let (bytes, hash) = file.finish().unwrap();
         assert_eq!((bytes, store.read("b/a.bin", 3).unwrap()), (3, Some(b"abc".to_vec())));
         assert_eq!(hash, "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad");
-        assert_eq!(sha256(b"abc"), hash);
         assert_eq!((store.range("b/a.bin", 1, 2).unwrap(), store.size("b/a.bin").unwrap()), (b"bc".to_vec(), Some(3)));
         assert!(store.range("b/a.bin", 1, 3).is_err());
         assert!(store.read("b/a.bin", 2).unwrap_err().to_string().contains("at most 2 bytes"));

@@ -5,7 +5,7 @@ use std::{sync::Arc, thread};
 use crossbeam_channel::{Receiver, bounded};
 use freerange_splat::Statistics;
 
-use crate::{DataError, Object, ObjectConfig};
+use crate::{DataError, Object};
 
 /// Something that has an object for every number.
 pub trait ObjectSource: Send + Sync {
@@ -15,23 +15,6 @@ pub trait ObjectSource: Send + Sync {
     /// Statistics over all its slices at `depth`, where they are known.
     fn statistics(&self, _depth: u32) -> Option<Statistics> {
         None
-    }
-}
-
-/// An endless source: object `index` is generated from seed `seed + index`.
-#[derive(Clone, Debug)]
-pub struct Generated {
-    /// How objects are made.
-    pub config: ObjectConfig,
-    /// Depths of the slices.
-    pub depths: Vec<u32>,
-    /// Seed of object 0.
-    pub seed: u64,
-}
-
-impl ObjectSource for Generated {
-    fn object(&self, index: u64) -> Result<Object, DataError> {
-        Object::generate(self.seed.wrapping_add(index), &self.config, &self.depths)
     }
 }
 

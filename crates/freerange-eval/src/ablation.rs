@@ -102,9 +102,9 @@ pub fn variants(sets: &[Set], values: &Values) -> Vec<Variant> {
         match set {
             Set::Guidance => {
                 let none = [
-                    ("No Classifier-Free Guidance", "no-classifier-free", json!({ "guidance": 1.0 })),
-                    ("No Photometric Gradient Guidance", "no-photometric", json!({ "photometric": 0.0 })),
-                    ("Neither", "no-guidance", json!({ "guidance": 1.0, "photometric": 0.0 })),
+                    ("No Classifier-Free Guidance", "no-classifier-free", json!({ "cfg_scale": 1.0 })),
+                    ("No Photometric Gradient Guidance", "no-photometric", json!({ "lambda_pg": 0.0 })),
+                    ("Neither", "no-guidance", json!({ "cfg_scale": 1.0, "lambda_pg": 0.0 })),
                 ];
                 none.into_iter().for_each(|(name, folder, sample)| add(set, name.into(), folder.into(), sample, None));
             }
@@ -112,10 +112,10 @@ pub fn variants(sets: &[Set], values: &Values) -> Vec<Variant> {
                 add(set, format!("{n} steps"), format!("steps-{n}"), json!({ "steps": n }), None);
             }),
             Set::Lambda => values.lambda.iter().for_each(|v| {
-                add(set, format!("lambda = {v}"), format!("lambda-{v}"), json!({ "photometric": v }), None);
+                add(set, format!("lambda = {v}"), format!("lambda-{v}"), json!({ "lambda_pg": v }), None);
             }),
             Set::Scale => values.scale.iter().for_each(|v| {
-                add(set, format!("s = {v}"), format!("scale-{v}"), json!({ "guidance": v }), None);
+                add(set, format!("s = {v}"), format!("scale-{v}"), json!({ "cfg_scale": v }), None);
             }),
             Set::Gradient => ["noisy", "estimate"].iter().for_each(|at| {
                 let name = format!("gradient at the {at}");
@@ -308,10 +308,10 @@ mod tests {
         let all = variants(&Set::ALL, &values());
         assert_eq!(all.len(), 3 + 2 + 2 + 1 + 2 + 2 + 2);
         assert_eq!(all.iter().map(|v| &v.folder).collect::<HashSet<_>>().len(), all.len());
-        let default = json!({ "steps": 50, "guidance": 1.5, "photometric": 500.0 });
+        let default = json!({ "steps": 50, "cfg_scale": 1.5, "lambda_pg": 500.0 });
         let of = |folder: &str| all.iter().find(|v| v.folder == folder).unwrap().apply(&default);
-        assert_eq!(of("steps-5"), json!({ "steps": 5, "guidance": 1.5, "photometric": 500.0 }));
-        assert_eq!(of("no-guidance"), json!({ "steps": 50, "guidance": 1.0, "photometric": 0.0 }));
+        assert_eq!(of("steps-5"), json!({ "steps": 5, "cfg_scale": 1.5, "lambda_pg": 500.0 }));
+        assert_eq!(of("no-guidance"), json!({ "steps": 50, "cfg_scale": 1.0, "lambda_pg": 0.0 }));
         assert_eq!(of("inputs-9"), default);
         assert_eq!(of("solver-heun-5")["solver"], "heun");
         assert_eq!(variants(&[Set::Scale], &values()).len(), 1);

@@ -98,7 +98,7 @@ pub struct Measured {
     pub peak_memory_bytes: Option<u64>,
     /// With several samples: mean, over all validation pixels and channels, of the standard deviation across samples.
     pub disagreement: Option<f64>,
-    /// Width and height of the validation images in pixels.
+    /// Width and height in pixels of the first validation image; each is scored at its own size.
     pub image_size: [u32; 2],
     /// Names of the input views.
     pub inputs: Vec<String>,

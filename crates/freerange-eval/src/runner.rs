@@ -3,6 +3,7 @@
 use std::time::Instant;
 
 use freerange_camera::{View, image_ops::composite};
+use freerange_core::Share;
 use freerange_raster::{RasterConfig, render};
 use freerange_splat::Cloud;
 use serde_json::Value;
@@ -40,12 +41,12 @@ pub trait Method {
     ///
     /// # Errors
     /// Why there are none: what the case's record will say.
-    fn make(&self, case: &Case, inputs: &[View]) -> Result<Made, String>;
+    fn make(&self, case: &Case, inputs: &[View]) -> Result<Reconstructed, String>;
 }
 
-/// What a method made.
+/// What a method gave.
 #[derive(Clone, Debug)]
-pub struct Made {
+pub struct Reconstructed {
     /// Seeds and Gaussians in the frame of the object's cameras.
     pub clouds: Vec<(u64, Cloud)>,
     /// What the user should know.
@@ -88,7 +89,7 @@ pub struct Shared {
     /// Which pictures are made.
     pub pictures: Pictures,
     /// Which of so many shares of the objects is worked on.
-    pub share: (usize, usize),
+    pub share: Share,
     /// The commit that the program was built from, for the records.
     pub commit: String,
 }
@@ -125,9 +126,8 @@ impl Run {
 /// # Errors
 /// If a run's folder cannot be read or written.
 pub fn work(runs: &[Run], shared: &Shared, tell: &mut dyn FnMut(Event<'_>)) -> Result<(), EvalError> {
-    let (share, shares) = shared.share;
     let names: Vec<(usize, &String)> =
-        shared.objects.names().iter().enumerate().filter(|(i, _)| i % shares == share).collect();
+        shared.objects.names().iter().enumerate().filter(|(i, _)| shared.share.contains(*i as u64)).collect();
     let per_object: usize = runs.iter().map(|r| r.views.len() * r.inputs.len()).sum();
     let total = names.len() * per_object;
     for (number, &(index, name)) in names.iter().enumerate() {
@@ -193,17 +193,18 @@ fn measure_case(run: &Run, case: &Case, object: &EvalObject, shared: &Shared) ->
 /// Numbers (but for time and memory), features for FID, and the picture strip.
 type Scored = (Measured, Vec<f32>, Option<Vec<u8>>);
 
-fn score(made: &Made, object: &EvalObject, inputs: &[View], shared: &Shared) -> Result<Scored, EvalError> {
+fn score(found: &Reconstructed, object: &EvalObject, inputs: &[View], shared: &Shared) -> Result<Scored, EvalError> {
     let validation = object.validation();
-    let (width, height) = validation.first().map_or((0, 0), |v| v.image.dimensions());
+    let sizes: Vec<[u32; 2]> = validation.iter().map(|v| v.image.dimensions().into()).collect();
     let truths: Vec<Vec<f32>> = validation.iter().map(|v| composite(&v.image, WHITE)).collect();
     let mut samples = Vec::new();
     let mut renders = Vec::new(); // [samples][views]
     let mut features = Vec::new();
-    for (seed, cloud) in &made.clouds {
+    for (seed, cloud) in &found.clouds {
         let images = validation.iter().map(|v| shown(cloud, v)).collect::<Result<Vec<_>, EvalError>>()?;
-        let pairs: Vec<Pair> = images.iter().zip(&truths).map(|(render, truth)| Pair { render, truth }).collect();
-        let scores = shared.scorer.score(&pairs, width as usize, height as usize)?;
+        let pairs = images.iter().zip(&truths).zip(&sizes);
+        let pairs = pairs.map(|((render, truth), size)| Pair { render, truth, size: size.map(|side| side as usize) });
+        let scores = shared.scorer.score(&pairs.collect::<Vec<_>>())?;
         let views = validation.iter().zip(scores.pairs).map(|(v, values)| ViewScores { name: v.name.clone(), values });
         samples.push(SampleScores { seed: *seed, gaussians: cloud.len(), views: views.collect() });
         // FID compares as many renders as images: those of the first sample.
@@ -221,13 +222,13 @@ fn score(made: &Made, object: &EvalObject, inputs: &[View], shared: &Shared) -> 
         seconds: 0.0,
         peak_memory_bytes: None,
         disagreement: disagreement(&renders),
-        image_size: [width, height],
+        image_size: sizes.first().copied().unwrap_or_default(),
         inputs: inputs.iter().map(|v| v.name.clone()).collect(),
         validation_sha256: object.validation_sha256(),
         samples,
         features: features.len(),
         picture: picture.is_some(),
-        notes: made.notes.clone(),
+        notes: found.notes.clone(),
         commit: shared.commit.clone(),
     };
     Ok((measured, features, picture))

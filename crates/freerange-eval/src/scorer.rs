@@ -40,6 +40,8 @@ pub struct Pair<'a> {
     pub render: &'a [f32],
     /// What it should be.
     pub truth: &'a [f32],
+    /// Their width and height in pixels.
+    pub size: [usize; 2],
 }
 
 /// What pairs gave.
@@ -107,13 +109,13 @@ impl Scorer {
         &self.used
     }
 
-    /// The scores of pairs of one size.
+    /// The scores of pairs, each at its own size.
     ///
     /// # Errors
-    /// If an image has another size, is too small for a metric, or holds a value that is not finite.
-    pub fn score(&self, pairs: &[Pair<'_>], width: usize, height: usize) -> Result<Scores, EvalError> {
+    /// If an image has not its pair's size, is too small for a metric, or holds a value that is not finite.
+    pub fn score(&self, pairs: &[Pair<'_>]) -> Result<Scores, EvalError> {
         let pixel = |pair: &Pair<'_>| {
-            let (a, b) = (pair.render, pair.truth);
+            let (a, b, [width, height]) = (pair.render, pair.truth, pair.size);
             let value = |metric: Metric| {
                 Ok::<f64, EvalError>(match metric {
                     Metric::Psnr => psnr(a, b)?.min(HIGHEST_PSNR),
@@ -138,14 +140,19 @@ impl Scorer {
         let mut scores = Scores { pairs: pairs_scored, features: Vec::new() };
         #[cfg(feature = "networks")]
         if !self.networks.metrics().is_empty() {
-            let pairs: Vec<_> =
-                pairs.iter().map(|p| freerange_metrics::Pair { render: p.render, truth: p.truth }).collect();
             let mut of_truths = Vec::new();
-            for (values, scored) in scores.pairs.iter_mut().zip(self.networks.score(&pairs, width, height)?) {
-                values.extend(scored.values.iter().map(|(m, v)| (m.name().to_owned(), *v)));
-                if let Some([render, truth]) = scored.inception {
-                    scores.features.extend(render);
-                    of_truths.extend(truth);
+            let mut values = scores.pairs.iter_mut();
+            // Networks take as many as they can at once, but of one size.
+            for same in pairs.chunk_by(|a, b| a.size == b.size) {
+                let [width, height] = same[0].size;
+                let same: Vec<_> =
+                    same.iter().map(|p| freerange_metrics::Pair { render: p.render, truth: p.truth }).collect();
+                for (scored, values) in self.networks.score(&same, width, height)?.into_iter().zip(&mut values) {
+                    values.extend(scored.values.iter().map(|(m, v)| (m.name().to_owned(), *v)));
+                    if let Some([render, truth]) = scored.inception {
+                        scores.features.extend(render);
+                        of_truths.extend(truth);
+                    }
                 }
             }
             scores.features.extend(of_truths);
@@ -206,5 +213,28 @@ mod tests {
         assert!((found - expected).abs() < 1e-3 * expected, "{found} {expected}");
         assert_eq!(fid(std::iter::empty()).unwrap(), None);
         assert!(fid((0..2).map(|_| Ok(vec![0.0; 2 * Inception::WIDTH - 2]))).is_err());
+    }
+}
+
+#[cfg(all(test, not(feature = "networks")))]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_pair_is_scored_at_its_own_size() {
+        let config = ScorerConfig { metrics: vec![Metric::Psnr, Metric::Ssim], weights: vec![], dino: String::new() };
+        let scorer = Scorer::open(&config).unwrap();
+        let image = |width: usize, height: usize, shift: f32| -> Vec<f32> {
+            (0..width * height * 3).map(|i| (i % 17) as f32 / 20.0 + shift).collect()
+        };
+        let (wide, high) = ([image(24, 16, 0.0), image(24, 16, 0.1)], [image(16, 30, 0.0), image(16, 30, 0.05)]);
+        let both = [
+            Pair { render: &wide[0], truth: &wide[1], size: [24, 16] },
+            Pair { render: &high[0], truth: &high[1], size: [16, 30] },
+        ];
+        let alone = both.map(|pair| scorer.score(&[pair]).unwrap().pairs.remove(0));
+        assert_eq!(scorer.score(&both).unwrap().pairs, alone);
+        assert!((alone[0]["psnr"] - 20.0).abs() < 1e-3 && alone[1]["psnr"] > 25.0, "{alone:?}");
+        assert!(scorer.score(&[Pair { size: [16, 30], ..both[0] }]).is_err());
     }
 }

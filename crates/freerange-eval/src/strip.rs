@@ -2,7 +2,7 @@
 
 use freerange_camera::{
     View,
-    image_ops::{composite, resize_area, sheet, to_picture},
+    image_ops::{composite, resize_area, sheet, shrunk_size, to_picture},
 };
 use image::{RgbaImage, codecs::jpeg::JpegEncoder};
 
@@ -40,12 +40,8 @@ pub fn strip(inputs: &[View], validation: &[View], renders: &[Vec<f32>]) -> Resu
 
 /// The picture within [`SIDE`], aspect kept. Transparent parts let the sheet's white through.
 fn small(image: &RgbaImage) -> RgbaImage {
-    let longest = image.width().max(image.height()).max(1);
-    if longest <= SIDE {
-        return image.clone();
-    }
-    let scaled = |v: u32| (f64::from(v) * f64::from(SIDE) / f64::from(longest)).round().max(1.0) as u32;
-    resize_area(image, scaled(image.width()), scaled(image.height()))
+    let (width, height) = shrunk_size(image.dimensions(), SIDE);
+    resize_area(image, width, height)
 }
 
 /// White at 0, red at a quarter, black at a half and beyond.

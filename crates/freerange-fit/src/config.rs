@@ -1,6 +1,7 @@
 //! What a fit can be told, with its defaults.
 
 use crate::FitError;
+pub use freerange_core::Background;
 use serde::{Deserialize, Serialize};
 
 /// Learning rate of each kind of channel, per step of Adam.
@@ -17,21 +18,6 @@ pub struct Rates {
     pub opacity: f64,
     /// Colour, sRGB-encoded 0..1.
     pub color: f64,
-}
-
-/// What is behind the Gaussians, and behind transparent pixels of the views.
-///
-/// Views without transparency are compared as they are: what is seen behind the object then is fitted, too.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Background {
-    /// Another uniformly drawn colour at every step: the Gaussians' opacity then has to agree with the views' alpha.
-    #[default]
-    Random,
-    /// White.
-    White,
-    /// Black.
-    Black,
 }
 
 /// Settings of [`fit`](crate::fit). The defaults suit objects in the canonical frame (a sphere of radius 0.5 about
@@ -74,6 +60,7 @@ pub struct FitConfig {
     /// Gaussians of at most this opacity are dead, and put where others are. 0..1
     pub dead_opacity: f64,
     /// What the Gaussians are rendered in front of.
+    /// Views without transparency are compared as they are: what is seen behind the object then is fitted, too.
     pub background: Background,
     /// Views compared at each step.
     pub views_per_step: usize,

@@ -1,12 +1,10 @@
 //! The views as a fit sees them: checked, shrunk, and put over a background.
 
-use crate::{Background, FitError};
+use crate::FitError;
 use freerange_camera::{Camera, View, image_ops};
 use freerange_raster::RasterConfig;
 use glam::{DMat3, DVec3};
 use image::RgbaImage;
-use rand::Rng;
-use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
 /// Views, each of its own size.
@@ -45,21 +43,6 @@ fn check(view: &View) -> Result<(), FitError> {
     Ok(())
 }
 
-/// Width and height with a longest side of at most `size`.
-fn shrunk((width, height): (u32, u32), size: Option<u32>) -> (u32, u32) {
-    let longest = width.max(height);
-    match size {
-        Some(size) if size < longest => {
-            let shrink = |side: u32| {
-                let exact = f64::from(side) * f64::from(size) / f64::from(longest);
-                (exact.round() as u32).max(1)
-            };
-            (shrink(width), shrink(height))
-        }
-        _ => (width, height),
-    }
-}
-
 impl Targets {
     /// Checks the views and shrinks those whose longest side exceeds `size`.
     pub fn new(views: &[View], size: Option<u32>) -> Result<Self, FitError> {
@@ -67,7 +50,10 @@ impl Targets {
             return Err(FitError::NoViews);
         }
         views.iter().try_for_each(check)?;
-        let sizes: Vec<(u32, u32)> = views.iter().map(|v| shrunk(v.image.dimensions(), size)).collect();
+        let sizes: Vec<(u32, u32)> = views
+            .iter()
+            .map(|v| size.map_or(v.image.dimensions(), |size| image_ops::shrunk_size(v.image.dimensions(), size)))
+            .collect();
         let sized = || views.par_iter().zip(&sizes);
         let longest = |(w, h): (u32, u32)| w.max(h) as f32;
         let raster =
@@ -105,15 +91,5 @@ impl Targets {
         let (width, height) = self.size(i);
         let inside = p.z > 0.0 && x >= 0.0 && y >= 0.0 && x < width as f64 && y < height as f64;
         inside.then(|| self.images[i].get_pixel(x as u32, y as u32).0)
-    }
-}
-
-impl Background {
-    pub(crate) fn draw(self, rng: &mut ChaCha8Rng) -> [f32; 3] {
-        match self {
-            Self::Random => rng.random(),
-            Self::White => [1.0; 3],
-            Self::Black => [0.0; 3],
-        }
     }
 }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use burn::tensor::{Device, Tensor, TensorData};
 use freerange_camera::{
     PatchLayout, Similarity, View, Window,
-    image_ops::{resize_area, to_f32_rgba},
+    image_ops::{resize_area, shrunk_size, to_f32_rgba},
     plucker,
 };
 use freerange_data::{InputFit, Object};
@@ -18,20 +18,15 @@ use rand_distr::{Distribution, StandardNormal};
 
 use crate::{
     FlowError,
-    config::{FrameJitter, LossConfig, Stage},
+    config::{FrameJitter, LossConfig, Stage, StartLoss},
     path::{guess_weight, render_weight},
     photometric::{Images, Targets},
 };
 
 /// The same view at most `size` pixels wide and high, aspect kept.
 pub fn shrink(view: &View, size: u32) -> View {
-    let (w, h) = view.image.dimensions();
-    let longest = w.max(h);
-    if longest <= size {
-        return view.clone();
-    }
-    let scaled = |x: u32| ((f64::from(x) * f64::from(size) / f64::from(longest)).round() as u32).max(1);
-    resized(view, scaled(w), scaled(h))
+    let (w, h) = shrunk_size(view.image.dimensions(), size);
+    resized(view, w, h)
 }
 
 /// The views of all objects as squares of one size, at most `size` pixels and at most those of the smallest, to compare
@@ -118,7 +113,7 @@ pub struct Batch {
     /// The input views as the encoder takes them.
     pub conditioning: Conditioning,
     /// The input views at the size of the gradient channels.
-    pub hint: Targets,
+    pub gradient_targets: Targets,
     /// The input views at the size of the rendering loss.
     pub seen: Targets,
     /// Held-out views at the size of the rendering loss; none if the configuration asks for none.
@@ -140,99 +135,136 @@ impl Batch {
         let start = loss.start.filter(|start| rng.random::<f32>() < start.share);
         let estimates = match rng.random::<f32>() < loss.self_conditioning {
             true if loss.estimates > 1 => rng.random_range(1..=loss.estimates),
-            fed => usize::from(fed),
+            once => usize::from(once),
         };
         let held_at_start = start.filter(|start| start.hold > 0.0 && rng.random::<f32>() < start.hold);
         let fits = start.map(|_| same_fit(objects, stage.depth, loss.held_views, rng)).transpose()?;
         let inputs = rng.random_range(loss.input_views.0..=loss.input_views.1);
         let one_sided = rng.random::<f32>() < loss.one_sided;
-
-        let mut data = Vec::with_capacity(b * n * channel::COUNT);
-        let mut noise = Vec::with_capacity(b * n * channel::COUNT);
-        let (mut on_path, mut guesses) = (Vec::new(), Vec::new());
-        let (mut t, mut conditional, mut backgrounds) = (Vec::new(), Vec::new(), Vec::new());
-        let (mut seen, mut held) = (Vec::new(), Vec::new());
+        let common =
+            Common { depth: stage.depth, loss, normalization, start, hold: held_at_start.is_some(), inputs, one_sided };
+        let mut rows = Rows::default();
         for (i, object) in objects.iter().enumerate() {
-            let fit = fits.as_ref().map(|fits| fits[i]);
-            let mut slice = match fit {
-                Some(fit) => fit.mended.clone(),
-                None if loss.random_patches => object.slice(stage.depth)?.shuffled(rng),
-                None => object.slice(stage.depth)?.clone(),
-            };
-            let mut epsilon: Vec<f32> = (0..n * channel::COUNT).map(|_| StandardNormal.sample(rng)).collect();
-            let first = start.map_or(0.0, |s| s.time);
-            let time = match held_at_start {
-                Some(_) => first,
-                None => first + (1.0 - first) * loss.time.draw(rng),
-            };
-            // A fit is made of the images: there is no way without them from it.
-            let blind = rng.random::<f32>() < loss.unconditional && start.is_none();
-            t.push(time);
-            conditional.push(if blind { 0.0 } else { 1.0 });
-            backgrounds.push(draw_background(rng));
-            let (chosen, rest) = match fit {
-                Some(fit) => views_of(fit, &object.views, rng),
-                None => choose_views(&object.views, inputs, one_sided, rng),
-            };
-
-            let frame = draw_frame(loss.frame_jitter, rng);
-            if frame != Similarity::IDENTITY {
-                slice.transform(frame.scale, frame.rotation, frame.translation);
-            }
-            let moved =
-                |v: &View| View { camera: v.camera.transformed(&frame), name: v.name.clone(), image: v.image.clone() };
-            seen.push(chosen.into_iter().map(moved).collect::<Vec<_>>());
-            held.push(rest.into_iter().take(loss.held_views).map(moved).collect::<Vec<_>>());
-            let clean = normalization.normalize(&slice);
-            match fit {
-                None => loss.coupling.pair(&mut epsilon, &clean),
-                Some(fit) => {
-                    let mut guess = fit.gaussians.clone();
-                    if frame != Similarity::IDENTITY {
-                        guess.transform(frame.scale, frame.rotation, frame.translation);
-                    }
-                    let guess = normalization.normalize(&guess);
-                    loss.coupling.pair(&mut epsilon, &guess); // as when sampling
-                    epsilon.iter_mut().for_each(|e| *e *= start.map_or(1.0, |s| s.noise));
-                    let w = guess_weight(time, first);
-                    on_path.extend(clean.iter().zip(&guess).map(|(x, g)| x + w * (g - x)));
-                    guesses.extend(guess);
-                }
-            }
-            data.extend(clean);
-            noise.extend(epsilon);
+            rows.draw(object, fits.as_ref().map(|fits| fits[i]), &common, rng)?;
         }
 
         let at = |views: &[Vec<View>], size: u32| {
             let small: Vec<Vec<View>> = views.iter().map(|o| o.iter().map(|v| shrink(v, size)).collect()).collect();
             let small: Vec<Vec<&View>> = small.iter().map(|o| o.iter().collect()).collect();
-            Ok::<_, FlowError>(Images::new(&small, device)?.on(&backgrounds))
+            Ok::<_, FlowError>(Images::new(&small, device)?.on(&rows.backgrounds))
         };
         let render_size = stage.render_size.unwrap_or(loss.render_size);
+        let seen: Vec<Vec<&View>> = rows.seen.iter().map(|o| o.iter().collect()).collect();
+        let conditioning = Conditioning::new(&seen, model, device)?;
+        let gradient_targets = at(&rows.seen, stage.gradient_size.unwrap_or(loss.gradient_size))?;
+        let seen = at(&rows.seen, render_size)?;
+        let held = if loss.held_views > 0 { Some(at(&rows.held, render_size)?) } else { None };
         let shape = [b, n, channel::COUNT];
         let tensor = |values: Vec<f32>| Tensor::<3>::from_data(TensorData::new(values, shape), device);
-        let data = tensor(data);
+        let data = tensor(rows.data);
         Ok(Self {
-            clean: if fits.is_some() { tensor(on_path) } else { data.clone() },
-            fits: fits.is_some().then(|| tensor(guesses)),
+            clean: if fits.is_some() { tensor(rows.on_path) } else { data.clone() },
+            fits: fits.is_some().then(|| tensor(rows.guesses)),
             estimates,
             data,
-            noise: tensor(noise),
+            noise: tensor(rows.noise),
             render_weights: match held_at_start.and_then(|start| start.render) {
                 Some(weight) => vec![weight; b],
-                None => t.iter().map(|&t| render_weight(t)).collect(),
+                None => rows.t.iter().map(|&t| render_weight(t)).collect(),
             },
-            t,
-            conditional: Tensor::from_data(TensorData::new(conditional, [b, 1, 1]), device),
-            conditioning: Conditioning::new(
-                &seen.iter().map(|o| o.iter().collect()).collect::<Vec<_>>(),
-                model,
-                device,
-            )?,
-            hint: at(&seen, stage.gradient_size.unwrap_or(loss.gradient_size))?,
-            seen: at(&seen, render_size)?,
-            held: if loss.held_views > 0 { Some(at(&held, render_size)?) } else { None },
+            t: rows.t,
+            conditional: Tensor::from_data(TensorData::new(rows.conditional, [b, 1, 1]), device),
+            conditioning,
+            gradient_targets,
+            seen,
+            held,
         })
+    }
+}
+
+/// What is the same for all objects of a batch.
+struct Common<'a> {
+    depth: u32,
+    loss: &'a LossConfig,
+    normalization: &'a Normalization,
+    /// Paths start from quick fits.
+    start: Option<StartLoss>,
+    /// All times are where such paths start.
+    hold: bool,
+    /// Input views of an object without a fit.
+    inputs: usize,
+    one_sided: bool,
+}
+
+/// The objects of a batch one after the other: see [`Batch`].
+#[derive(Default)]
+struct Rows {
+    data: Vec<f32>,
+    noise: Vec<f32>,
+    on_path: Vec<f32>,
+    guesses: Vec<f32>,
+    t: Vec<f32>,
+    conditional: Vec<f32>,
+    backgrounds: Vec<[f32; 3]>,
+    seen: Vec<Vec<View>>,
+    held: Vec<Vec<View>>,
+}
+
+impl Rows {
+    fn draw(
+        &mut self,
+        object: &Object,
+        fit: Option<&InputFit>,
+        common: &Common<'_>,
+        rng: &mut ChaCha8Rng,
+    ) -> Result<(), FlowError> {
+        let &Common { depth, loss, normalization, start, hold, inputs, one_sided } = common;
+        let mut slice = match fit {
+            Some(fit) => fit.mended.clone(),
+            None if loss.random_patches => object.slice(depth)?.shuffled(rng),
+            None => object.slice(depth)?.clone(),
+        };
+        let values = (1usize << depth) * channel::COUNT;
+        let mut epsilon: Vec<f32> = (0..values).map(|_| StandardNormal.sample(rng)).collect();
+        let first = start.map_or(0.0, |s| s.time);
+        let time = if hold { first } else { first + (1.0 - first) * loss.time.draw(rng) };
+        // A fit is made of the images: there is no way without them from it.
+        let blind = rng.random::<f32>() < loss.unconditional && start.is_none();
+        self.t.push(time);
+        self.conditional.push(if blind { 0.0 } else { 1.0 });
+        self.backgrounds.push(draw_background(rng));
+        let (chosen, rest) = match fit {
+            Some(fit) => views_of(fit, &object.views, rng),
+            None => choose_views(&object.views, inputs, one_sided, rng),
+        };
+
+        let frame = draw_frame(loss.frame_jitter, rng);
+        if frame != Similarity::IDENTITY {
+            slice.transform(frame.scale, frame.rotation, frame.translation);
+        }
+        let moved =
+            |v: &View| View { camera: v.camera.transformed(&frame), name: v.name.clone(), image: v.image.clone() };
+        self.seen.push(chosen.into_iter().map(moved).collect::<Vec<_>>());
+        self.held.push(rest.into_iter().take(loss.held_views).map(moved).collect::<Vec<_>>());
+        let clean = normalization.normalize(&slice);
+        match fit {
+            None => loss.coupling.pair(&mut epsilon, &clean),
+            Some(fit) => {
+                let mut guess = fit.gaussians.clone();
+                if frame != Similarity::IDENTITY {
+                    guess.transform(frame.scale, frame.rotation, frame.translation);
+                }
+                let guess = normalization.normalize(&guess);
+                loss.coupling.pair(&mut epsilon, &guess); // as when sampling
+                epsilon.iter_mut().for_each(|e| *e *= start.map_or(1.0, |s| s.noise));
+                let w = guess_weight(time, first);
+                self.on_path.extend(clean.iter().zip(&guess).map(|(x, g)| x + w * (g - x)));
+                self.guesses.extend(guess);
+            }
+        }
+        self.data.extend(clean);
+        self.noise.extend(epsilon);
+        Ok(())
     }
 }
 

@@ -80,4 +80,7 @@ pub enum FlowError {
     /// The training data.
     #[error(transparent)]
     Data(#[from] freerange_data::DataError),
+    /// Objects made on the fly.
+    #[error(transparent)]
+    Build(#[from] freerange_build::BuildError),
 }

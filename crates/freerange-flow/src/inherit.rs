@@ -40,6 +40,7 @@ pub(crate) fn load(path: &Path) -> Result<Table, FlowError> {
             return Err(state(format!("expected at most {DEEPEST} parents in a row")));
         }
         let mut table: Table = text.parse().map_err(|e: toml::de::Error| state(e.to_string()))?;
+        rename(&mut table).map_err(state)?;
         next = match table.remove("parent") {
             None => None,
             Some(Value::String(name)) if PRESETS.iter().any(|(preset, _)| *preset == name) => Some(name.into()),
@@ -56,6 +57,28 @@ pub(crate) fn load(path: &Path) -> Result<Table, FlowError> {
     }
     let oldest_first = chain.into_iter().rev().map(|(_, table)| table);
     Ok(oldest_first.reduce(merged).unwrap_or_default())
+}
+
+/// Former names of fields: the tables they lie in, the name of then, that of now.
+const RENAMED: [(&[&str], &str, &str); 3] = [
+    (&["sample"], "guidance", "cfg_scale"),
+    (&["sample"], "photometric", "lambda_pg"),
+    (&["sample", "from_noise"], "photometric", "lambda_pg"),
+];
+
+/// Gives fields their names of now, so that a descendant may say it in other words than its parent.
+fn rename(table: &mut Table) -> Result<(), String> {
+    for (tables, then, now) in RENAMED {
+        let inner = tables.iter().try_fold(&mut *table, |t, key| t.get_mut(*key)?.as_table_mut());
+        if let Some(inner) = inner
+            && let Some(value) = inner.remove(then)
+            && inner.insert(now.into(), value).is_some()
+        {
+            let tables = tables.join(".");
+            return Err(format!("field `{tables}.{now}`: expected it once, found it also as `{tables}.{then}`"));
+        }
+    }
+    Ok(())
 }
 
 /// Makes paths, which are relative to the file that names them, ones that can be opened from here.
@@ -141,6 +164,25 @@ mod tests {
         );
         assert_eq!(shards("b/cloud.toml"), "s3://bucket/shards");
         assert_eq!(shards("b/whole.toml"), "/shards");
+    }
+
+    #[test]
+    fn former_names_of_fields_are_understood_along_the_whole_chain() {
+        let files = [
+            ("old.toml", "parent = \"tiny\"\nsample = { guidance = 1.5, photometric = 0.25 }\n"),
+            ("new.toml", "parent = \"old.toml\"\nsample.cfg_scale = 3.0\n"),
+            ("older.toml", "parent = \"new.toml\"\nsample.photometric = 0.5\n"),
+            ("both.toml", "parent = \"tiny\"\nsample = { guidance = 1.5, cfg_scale = 1.5 }\n"),
+        ];
+        let folder = place(&files);
+        let sample = |name: &str| TrainConfig::load(&folder.path().join(name)).map(|c| c.sample);
+        let scales = |name: &str| sample(name).map(|s| (s.cfg_scale, s.lambda_pg)).unwrap();
+        assert_eq!(
+            [scales("old.toml"), scales("new.toml"), scales("older.toml")],
+            [(1.5, 0.25), (3.0, 0.25), (3.0, 0.5)]
+        );
+        let error = sample("both.toml").unwrap_err().to_string();
+        assert!(error.contains("both.toml") && error.contains("sample.guidance"), "{error}");
     }
 
     #[test]

@@ -4,8 +4,9 @@ use std::{cell::RefCell, ops::ControlFlow};
 
 use burn::tensor::{Device, Tensor, TensorData};
 use freerange_camera::View;
+pub use freerange_core::Background;
 use freerange_fit::{QuickFitConfig, tree_slice};
-use freerange_model::{Checkpoint, Compute, Feedback};
+use freerange_model::{Checkpoint, Compute, Feedback, FreeRange, ModelConfig};
 use freerange_splat::{Cloud, channel};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -13,7 +14,7 @@ use rand_distr::{Distribution, StandardNormal};
 
 use crate::{
     FlowError,
-    batch::{Conditioning, draw_background, squares},
+    batch::{Conditioning, squares},
     coupling::Coupling,
     photometric::{Images, Photometric},
 };
@@ -34,10 +35,12 @@ pub struct SampleConfig {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub start: Option<StartConfig>,
     /// Classifier-free guidance scale s: `z_u + s (z_c - z_u)`. 1 switches it off (and halves the work).
-    pub guidance: f32,
+    #[serde(alias = "guidance")]
+    pub cfg_scale: f32,
     /// Photometric guidance scale lambda_PG. 0 switches it off. What it multiplies is told by `photometric_step`. It acts
     /// on what the next step starts from, and on the result where there is one step only.
-    pub photometric: f32,
+    #[serde(alias = "photometric")]
+    pub lambda_pg: f32,
     /// The gradient that photometric guidance follows.
     pub photometric_step: PhotometricStep,
     /// Photometric steps per step of the solver, each at the estimate that the one before has moved. The paper takes one.
@@ -78,8 +81,9 @@ pub struct FromNoise {
     pub steps: usize,
     /// [`SampleConfig::solver`]
     pub solver: Solver,
-    /// [`SampleConfig::photometric`]
-    pub photometric: f32,
+    /// [`SampleConfig::lambda_pg`]
+    #[serde(alias = "photometric")]
+    pub lambda_pg: f32,
     /// [`SampleConfig::mend`]
     #[serde(default, skip_serializing_if = "is_zero")]
     pub mend: usize,
@@ -92,8 +96,8 @@ impl Default for SampleConfig {
             solver: Solver::Euler,
             depth: None,
             start: None,
-            guidance: 2.0,
-            photometric: 50.0,
+            cfg_scale: 2.0,
+            lambda_pg: 50.0,
             photometric_step: PhotometricStep::Gradient,
             photometric_repeats: 1,
             photometric_size: None,
@@ -122,8 +126,8 @@ impl SampleConfig {
     /// The same from pure noise: see [`from_noise`](Self::from_noise).
     pub fn without_start(mut self) -> Self {
         if let (Some(_), Some(noise)) = (self.start.take(), self.from_noise) {
-            let FromNoise { steps, solver, photometric, mend } = noise;
-            self = Self { steps, solver, photometric, mend, ..self };
+            let FromNoise { steps, solver, lambda_pg, mend } = noise;
+            self = Self { steps, solver, lambda_pg, mend, ..self };
         }
         self
     }
@@ -131,8 +135,7 @@ impl SampleConfig {
     /// How samples from pure noise are mended: see [`mend`](Self::mend); none if they are not.
     pub fn mending(&self) -> Option<Self> {
         let start = StartConfig { time: 0.0, noise: 0.0, ..StartConfig::default() };
-        let held =
-            Self { steps: self.mend, solver: Solver::Hold, start: Some(start), photometric: 0.0, ..self.clone() };
+        let held = Self { steps: self.mend, solver: Solver::Hold, start: Some(start), lambda_pg: 0.0, ..self.clone() };
         (self.mend > 0 && self.start.is_none()).then_some(held)
     }
 
@@ -172,11 +175,11 @@ impl SampleConfig {
                 found: e.to_string(),
             })?;
         }
-        if !self.guidance.is_finite() || self.guidance < 0.0 {
-            return bad("guidance", "a finite number, 0 or more", self.guidance.to_string());
+        if !self.cfg_scale.is_finite() || self.cfg_scale < 0.0 {
+            return bad("cfg_scale", "a finite number, 0 or more", self.cfg_scale.to_string());
         }
-        if !self.photometric.is_finite() || self.photometric < 0.0 {
-            return bad("photometric", "a finite number, 0 or more", self.photometric.to_string());
+        if !self.lambda_pg.is_finite() || self.lambda_pg < 0.0 {
+            return bad("lambda_pg", "a finite number, 0 or more", self.lambda_pg.to_string());
         }
         if !(1..=1000).contains(&self.photometric_repeats) {
             return bad("photometric_repeats", "1 to 1000", self.photometric_repeats.to_string());
@@ -245,27 +248,6 @@ impl PhotometricStep {
     }
 }
 
-/// What lies behind the object where renders are compared with images.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Background {
-    /// A new colour for every object and step: no object can hide against all of them.
-    #[default]
-    Random,
-    /// White, as in the evaluation.
-    White,
-}
-
-impl Background {
-    /// A colour, drawn from `rng` if need be.
-    pub fn draw(self, rng: &mut ChaCha8Rng) -> [f32; 3] {
-        match self {
-            Self::Random => draw_background(rng),
-            Self::White => [1.0; 3],
-        }
-    }
-}
-
 /// How the flow is integrated. All take uniform steps in time.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -297,18 +279,18 @@ pub struct Step {
 }
 
 /// Integrates the flow `dz/dt = (z1_hat - z) / (1 - t)` from `z` at time `start` in `steps` uniform steps; after each,
-/// `z <- z - push`.
+/// `z <- z - displacement`.
 ///
-/// `estimate` gives the guided estimate z1_hat of the clean sample, `push` the photometric step `lambda grad` taken at the
+/// `estimate` gives the guided estimate z1_hat of the clean sample, `guide` the displacement, the photometric step `lambda grad` taken at the
 /// first estimate of each step (or nothing; [`Solver::Hold`] leaves it to the callbacks, which share the estimate). Returns the
-/// last estimate less its push; the paper's, which is what it denormalises, has none.
+/// last estimate less its displacement; the paper's, which is what it denormalises, has none.
 pub fn integrate(
     mut z: Tensor<3>,
     start: f32,
     steps: usize,
     solver: Solver,
     mut estimate: impl FnMut(&Step) -> Result<Tensor<3>, FlowError>,
-    mut push: impl FnMut(&Step, &Tensor<3>) -> Result<Option<Tensor<3>>, FlowError>,
+    mut guide: impl FnMut(&Step, &Tensor<3>) -> Result<Option<Tensor<3>>, FlowError>,
 ) -> Result<Tensor<3>, FlowError> {
     let time = |i: usize| start + (1.0 - start) * i as f32 / steps as f32;
     let mut last = z.clone();
@@ -316,8 +298,8 @@ pub fn integrate(
         if solver == Solver::Hold {
             let step = Step { index, t: start, z: z.clone() };
             last = estimate(&step)?;
-            match push(&step, &last)? {
-                Some(push) if index + 1 == steps => return Ok(last - push),
+            match guide(&step, &last)? {
+                Some(displacement) if index + 1 == steps => return Ok(last - displacement),
                 _ => continue,
             }
         }
@@ -343,9 +325,9 @@ pub fn integrate(
             }
             _ => towards(last.clone()),
         };
-        z = match push(&step, &last)? {
-            Some(push) if index + 1 == steps => return Ok(last - push),
-            Some(push) => moved - push,
+        z = match guide(&step, &last)? {
+            Some(displacement) if index + 1 == steps => return Ok(last - displacement),
+            Some(displacement) => moved - displacement,
             None => moved,
         };
     }
@@ -414,149 +396,241 @@ pub fn reconstruct(
     if objects.is_empty() || seeds.is_empty() {
         return Ok(vec![Vec::new(); objects.len()]);
     }
-    let (depth, fewest) = (config.depth.unwrap_or(checkpoint.depth), checkpoint.config.gaussians_per_token);
-    if 1usize << depth < fewest {
-        let expected = format!("at least {}: a token of the model is {fewest} Gaussians", fewest.ilog2());
-        return Err(FlowError::Config { field: "sample.depth".into(), expected, found: depth.to_string() });
-    }
-    let model = checkpoint.model.clone().with_compute(config.compute);
-    let (b, n) = (objects.len() * seeds.len(), 1usize << depth);
-
-    // The images are encoded once; every sample and step shares the tokens.
-    let views: Vec<Vec<&View>> = objects.iter().map(|o| o.iter().collect()).collect();
-    let tokens = Conditioning::new(&views, &checkpoint.config, device)?.encode(&model); // [objects, m, c]
-    let [_, m, c] = tokens.dims();
-    let tokens = tokens.unsqueeze_dim::<4>(1).repeat_dim(1, seeds.len()).reshape([b, m, c]);
-    let both = Tensor::cat(vec![tokens.clone(), tokens.zeros_like()], 0);
-
-    let photometric = Photometric::new(&checkpoint.normalization, device);
-    let rms = Tensor::<1>::from_floats(checkpoint.gradient_rms, device).reshape([1, 1, channel::COUNT]);
-    let at_size = |size: u32| {
-        let small = squares(objects, size);
-        let small: Vec<Vec<&View>> = small.iter().flat_map(|o| vec![o.iter().collect(); seeds.len()]).collect();
-        Images::new(&small, device)
-    };
-    let images = at_size(config.gradient_size)?;
-    let guiding = match config.photometric_size {
-        Some(size) if size != config.gradient_size => at_size(size)?,
-        _ => images.clone(),
-    };
-    let starts = match (&config.start, fits) {
-        (None, _) => None,
-        (Some(start), Some(fits)) if fits.len() == objects.len() => Some((start, fits)),
-        (Some(_), given) => {
-            return Err(FlowError::Config {
-                field: "sample.start".into(),
-                expected: format!("a quick fit of each of {} objects", objects.len()),
-                found: given.map_or(0, <[Cloud]>::len).to_string(),
-            });
-        }
-    };
-    // Everything random about a sample comes from its own seed, whatever else is in the batch.
-    let mut noise = Vec::with_capacity(b * n * channel::COUNT);
-    let mut backgrounds = vec![Vec::with_capacity(b); config.steps]; // [steps][b]
-    let mut guesses = Vec::new();
-    for object in 0..objects.len() {
-        let guess = match starts {
-            None => None,
-            Some((_, fits)) => {
-                let slice = tree_slice(&fits[object], n.ilog2()).map_err(freerange_data::DataError::from)?;
-                Some(checkpoint.normalization.normalize(&slice))
-            }
-        };
-        for &seed in seeds {
-            let mut rng = ChaCha8Rng::seed_from_u64(seed);
-            let mut one: Vec<f32> = (0..n * channel::COUNT).map(|_| StandardNormal.sample(&mut rng)).collect();
-            match (&guess, starts) {
-                (Some(guess), Some((start, _))) => {
-                    config.coupling.pair(&mut one, guess);
-                    one.iter_mut().for_each(|e| *e *= start.noise);
-                    guesses.extend_from_slice(guess);
-                }
-                _ => config.coupling.group(&mut one),
-            }
-            noise.extend(one);
-            backgrounds.iter_mut().for_each(|step| step.push(config.background.draw(&mut rng)));
-        }
-    }
-    let tensor = |values: Vec<f32>| Tensor::<3>::from_data(TensorData::new(values, [b, n, channel::COUNT]), device);
-    let noise = tensor(noise);
-    let guess = starts.is_some().then(|| tensor(guesses));
-    let begin = starts.map_or(0.0, |(start, _)| start.time);
-    let z = match &guess {
-        Some(guess) => noise.mul_scalar(1.0 - begin) + guess.clone().mul_scalar(begin),
-        None => noise,
-    };
-
-    let previous = RefCell::new(guess); // the latest estimate of the clean sample
-    let estimate = |step: &Step| {
-        let known = previous.borrow().clone();
-        let hint = match checkpoint.config.gradient_channels {
-            false => None,
-            true => {
-                let at = match (config.gradient_at, &known) {
-                    (GradientAt::Estimate, Some(estimate)) => estimate.clone(),
-                    _ => step.z.clone(),
-                };
-                Some(scale_gradient(photometric.gradient(at, &images.on(&backgrounds[step.index]))?, &rms))
-            }
-        };
-        let observation = match &known {
-            Some(known) if checkpoint.config.observation_channels => {
-                Some(photometric.observe(known.clone(), &images.on(&backgrounds[step.index]))?)
-            }
-            _ => None,
-        };
-        let earlier = known.filter(|_| checkpoint.config.estimate_channels);
-        let estimate = if config.guidance == 1.0 {
-            let t = Tensor::full([b], step.t, device);
-            let feedback = Feedback { gradient: hint, estimate: earlier, observation };
-            model.denoise(step.z.clone(), feedback, tokens.clone(), t)
-        } else {
-            // Conditional and unconditional branch in one batch.
-            let z = step.z.clone().repeat_dim(0, 2);
-            let blind = |x: Tensor<3>| Tensor::cat(vec![x.clone(), x.zeros_like()], 0);
-            let t = Tensor::full([2 * b], step.t, device);
-            let feedback = Feedback {
-                gradient: hint.map(blind),
-                estimate: earlier.map(blind),
-                observation: observation.map(blind),
-            };
-            let out = model.denoise(z, feedback, both.clone(), t);
-            classifier_free(out.clone().narrow(0, 0, b), out.narrow(0, b, b), config.guidance)
-        };
-        previous.replace(Some(estimate.clone()));
-        Ok(estimate)
-    };
-    let push = |step: &Step, estimate: &Tensor<3>| {
+    let start = config.start.as_ref().map(|start| Start::new(start, fits, objects.len())).transpose()?;
+    let drawn = Drawn::new(checkpoint, config, start, objects.len(), seeds, device)?;
+    let sampler = Sampler::new(checkpoint, objects, config, seeds.len(), &drawn, device)?;
+    let guide = |step: &Step, estimate: &Tensor<3>| {
         let told = Estimate {
             index: step.index,
             t: step.t,
             normalized: estimate,
-            photometric: &photometric,
+            photometric: &sampler.photometric,
             seeds: seeds.len(),
         };
-        if progress(&told).is_break() {
-            return Err(FlowError::Cancelled);
+        match progress(&told) {
+            ControlFlow::Break(()) => Err(FlowError::Cancelled),
+            ControlFlow::Continue(()) => sampler.displacement(step, estimate),
         }
+    };
+    let begin = start.map_or(0.0, |start| start.config.time);
+    let estimate = |step: &Step| sampler.estimate(step);
+    let found = integrate(drawn.z.clone(), begin, config.steps, config.solver, estimate, guide)?;
+    clouds(sampler.photometric.denormalize(found), seeds.len())
+}
+
+/// A start from quick fits, one for each object.
+#[derive(Clone, Copy)]
+struct Start<'a> {
+    config: &'a StartConfig,
+    fits: &'a [Cloud],
+}
+
+impl<'a> Start<'a> {
+    fn new(config: &'a StartConfig, fits: Option<&'a [Cloud]>, objects: usize) -> Result<Self, FlowError> {
+        match fits {
+            Some(fits) if fits.len() == objects => Ok(Self { config, fits }),
+            given => Err(FlowError::Config {
+                field: "sample.start".into(),
+                expected: format!("a quick fit of each of {objects} objects"),
+                found: given.map_or(0, <[Cloud]>::len).to_string(),
+            }),
+        }
+    }
+}
+
+/// Everything random about a batch of samples, each from its own seed, whatever else is in the batch.
+struct Drawn {
+    /// Where the flow begins. `[b, n, 14]`
+    z: Tensor<3>,
+    /// The quick fits, in the order of their tree; none of pure noise. `[b, n, 14]`
+    guess: Option<Tensor<3>>,
+    /// `[steps][b]`
+    backgrounds: Vec<Vec<[f32; 3]>>,
+}
+
+impl Drawn {
+    fn new(
+        checkpoint: &Checkpoint,
+        config: &SampleConfig,
+        start: Option<Start<'_>>,
+        objects: usize,
+        seeds: &[u64],
+        device: &Device,
+    ) -> Result<Self, FlowError> {
+        let (depth, fewest) = (config.depth.unwrap_or(checkpoint.depth), checkpoint.config.gaussians_per_token);
+        if 1usize << depth < fewest {
+            let expected = format!("at least {}: a token of the model is {fewest} Gaussians", fewest.ilog2());
+            return Err(FlowError::Config { field: "sample.depth".into(), expected, found: depth.to_string() });
+        }
+        let (b, n) = (objects * seeds.len(), 1usize << depth);
+        let mut noise = Vec::with_capacity(b * n * channel::COUNT);
+        let mut backgrounds = vec![Vec::with_capacity(b); config.steps];
+        let mut guesses = Vec::new();
+        for object in 0..objects {
+            let guess = match start {
+                None => None,
+                Some(start) => {
+                    let slice = tree_slice(&start.fits[object], depth).map_err(freerange_build::BuildError::from)?;
+                    Some(checkpoint.normalization.normalize(&slice))
+                }
+            };
+            for &seed in seeds {
+                let mut rng = ChaCha8Rng::seed_from_u64(seed);
+                let mut one: Vec<f32> = (0..n * channel::COUNT).map(|_| StandardNormal.sample(&mut rng)).collect();
+                match (&guess, start) {
+                    (Some(guess), Some(start)) => {
+                        config.coupling.pair(&mut one, guess);
+                        one.iter_mut().for_each(|e| *e *= start.config.noise);
+                        guesses.extend_from_slice(guess);
+                    }
+                    _ => config.coupling.group(&mut one),
+                }
+                noise.extend(one);
+                backgrounds.iter_mut().for_each(|step| step.push(config.background.draw(&mut rng)));
+            }
+        }
+        let tensor = |values: Vec<f32>| Tensor::<3>::from_data(TensorData::new(values, [b, n, channel::COUNT]), device);
+        let noise = tensor(noise);
+        let guess = start.is_some().then(|| tensor(guesses));
+        let begin = start.map_or(0.0, |start| start.config.time);
+        let z = match &guess {
+            Some(guess) => noise.mul_scalar(1.0 - begin) + guess.clone().mul_scalar(begin),
+            None => noise,
+        };
+        Ok(Self { z, guess, backgrounds })
+    }
+}
+
+/// What all steps of a batch of samples share.
+struct Sampler<'a> {
+    config: &'a SampleConfig,
+    network: &'a ModelConfig,
+    model: FreeRange,
+    device: &'a Device,
+    /// Of the images, once for each sample. `[b, m, c]`
+    tokens: Tensor<3>,
+    /// The same, and none. `[2 b, m, c]`
+    both: Tensor<3>,
+    photometric: Photometric,
+    /// Root mean square of the gradient's channels in training. `[1, 1, 14]`
+    rms: Tensor<3>,
+    /// What the gradient for the network is taken on.
+    images: Images,
+    /// What guidance is taken on.
+    guiding: Images,
+    backgrounds: &'a [Vec<[f32; 3]>],
+    /// The latest estimate of the clean sample.
+    previous: RefCell<Option<Tensor<3>>>,
+}
+
+impl<'a> Sampler<'a> {
+    fn new(
+        checkpoint: &'a Checkpoint,
+        objects: &[&[View]],
+        config: &'a SampleConfig,
+        seeds: usize,
+        drawn: &'a Drawn,
+        device: &'a Device,
+    ) -> Result<Self, FlowError> {
+        let model = checkpoint.model.clone().with_compute(config.compute);
+        // The images are encoded once; every sample and step shares the tokens.
+        let views: Vec<Vec<&View>> = objects.iter().map(|o| o.iter().collect()).collect();
+        let tokens = Conditioning::new(&views, &checkpoint.config, device)?.encode(&model); // [objects, m, c]
+        let [count, m, c] = tokens.dims();
+        let tokens = tokens.unsqueeze_dim::<4>(1).repeat_dim(1, seeds).reshape([count * seeds, m, c]);
+        let both = Tensor::cat(vec![tokens.clone(), tokens.zeros_like()], 0);
+        let at_size = |size: u32| {
+            let small = squares(objects, size);
+            let small: Vec<Vec<&View>> = small.iter().flat_map(|o| vec![o.iter().collect(); seeds]).collect();
+            Images::new(&small, device)
+        };
+        let images = at_size(config.gradient_size)?;
+        let guiding = match config.photometric_size {
+            Some(size) if size != config.gradient_size => at_size(size)?,
+            _ => images.clone(),
+        };
+        Ok(Self {
+            config,
+            network: &checkpoint.config,
+            model,
+            device,
+            tokens,
+            both,
+            photometric: Photometric::new(&checkpoint.normalization, device),
+            rms: Tensor::<1>::from_floats(checkpoint.gradient_rms, device).reshape([1, 1, channel::COUNT]),
+            images,
+            guiding,
+            backgrounds: &drawn.backgrounds,
+            previous: RefCell::new(drawn.guess.clone()),
+        })
+    }
+
+    /// The guided estimate of the clean sample. `[b, n, 14]`
+    fn estimate(&self, step: &Step) -> Result<Tensor<3>, FlowError> {
+        let feedback = self.feedback(step)?;
+        let b = step.z.dims()[0];
+        let estimate = if self.config.cfg_scale == 1.0 {
+            let t = Tensor::full([b], step.t, self.device);
+            self.model.denoise(step.z.clone(), feedback, self.tokens.clone(), t)
+        } else {
+            // Conditional and unconditional branch in one batch.
+            let z = step.z.clone().repeat_dim(0, 2);
+            let blind = |x: Tensor<3>| Tensor::cat(vec![x.clone(), x.zeros_like()], 0);
+            let t = Tensor::full([2 * b], step.t, self.device);
+            let feedback = Feedback {
+                gradient: feedback.gradient.map(blind),
+                estimate: feedback.estimate.map(blind),
+                observation: feedback.observation.map(blind),
+            };
+            let out = self.model.denoise(z, feedback, self.both.clone(), t);
+            classifier_free(out.clone().narrow(0, 0, b), out.narrow(0, b, b), self.config.cfg_scale)
+        };
+        self.previous.replace(Some(estimate.clone()));
+        Ok(estimate)
+    }
+
+    /// What the network is told besides the sample: see [`Feedback`].
+    fn feedback(&self, step: &Step) -> Result<Feedback, FlowError> {
+        let known = self.previous.borrow().clone();
+        let targets = || self.images.on(&self.backgrounds[step.index]);
+        let gradient = match self.network.gradient_channels {
+            false => None,
+            true => {
+                let at = match (self.config.gradient_at, &known) {
+                    (GradientAt::Estimate, Some(estimate)) => estimate.clone(),
+                    _ => step.z.clone(),
+                };
+                Some(scale_gradient(self.photometric.gradient(at, &targets())?, &self.rms))
+            }
+        };
+        let observation = match &known {
+            Some(known) if self.network.observation_channels => {
+                Some(self.photometric.observe(known.clone(), &targets())?)
+            }
+            _ => None,
+        };
+        Ok(Feedback { gradient, estimate: known.filter(|_| self.network.estimate_channels), observation })
+    }
+
+    /// How far photometric guidance moves an estimate, to be subtracted; none where there is no guidance.
+    fn displacement(&self, step: &Step, estimate: &Tensor<3>) -> Result<Option<Tensor<3>>, FlowError> {
+        let config = self.config;
         // What the paper returns is the last estimate as the network gives it. A single step would be guided by nothing.
         let last = step.index + 1 == config.steps && config.steps > 1;
-        if config.photometric == 0.0 || last {
+        if config.lambda_pg == 0.0 || last {
             return Ok(None);
         }
-        let targets = guiding.on(&backgrounds[step.index]);
+        let targets = self.guiding.on(&self.backgrounds[step.index]);
         let mut moved = estimate.clone();
         for _ in 0..config.photometric_repeats {
-            let gradient = photometric.gradient(moved.clone(), &targets)?;
-            moved = moved - config.photometric_step.of(gradient, &rms).mul_scalar(config.photometric);
+            let gradient = self.photometric.gradient(moved.clone(), &targets)?;
+            moved = moved - config.photometric_step.of(gradient, &self.rms).mul_scalar(config.lambda_pg);
         }
         if config.solver == Solver::Hold {
-            previous.replace(Some(moved.clone())); // the sample does not move: what is fed back does
+            self.previous.replace(Some(moved.clone())); // the sample does not move: what is fed back does
         }
         Ok(Some(estimate.clone() - moved))
-    };
-    let estimate = integrate(z, begin, config.steps, config.solver, estimate, push)?;
-    clouds(photometric.denormalize(estimate), seeds.len())
+    }
 }
 
 /// Largest magnitude of a gradient channel, in units of its root mean square: a few Gaussians have gradients
@@ -578,6 +652,18 @@ mod tests {
     const S: f32 = 0.4;
 
     #[test]
+    fn old_names_are_read_and_new_ones_written() {
+        let old = serde_json::json!({ "guidance": 1.5, "photometric": 0.25, "from_noise":
+            { "steps": 3, "solver": "euler", "photometric": 0.5 } });
+        let found: SampleConfig = serde_json::from_value(old).unwrap();
+        assert_eq!((found.cfg_scale, found.lambda_pg, found.from_noise.unwrap().lambda_pg), (1.5, 0.25, 0.5));
+        let new = serde_json::to_value(&found).unwrap();
+        assert_eq!((&new["cfg_scale"], &new["lambda_pg"]), (&1.5.into(), &0.25.into()));
+        assert!(new.get("guidance").is_none() && new.get("photometric").is_none());
+        assert_eq!(serde_json::from_value::<SampleConfig>(new).unwrap(), found);
+    }
+
+    #[test]
     fn guidance_follows_the_gradient_or_its_channels_at_one_scale() {
         let tensor = |values: [f32; 3]| Tensor::<3>::from_data([[values]], &Device::flex());
         let (gradient, rms) = (tensor([2e-4, -6e-6, 9.0]), tensor([1e-4, 3e-6, 0.1]));
@@ -589,24 +675,24 @@ mod tests {
 
     #[test]
     fn a_model_of_fits_starts_from_noise_in_its_own_way() {
-        let noise = FromNoise { steps: 30, solver: Solver::Multistep, photometric: 0.2, mend: 3 };
+        let noise = FromNoise { steps: 30, solver: Solver::Multistep, lambda_pg: 0.2, mend: 3 };
         let fit = SampleConfig {
             steps: 4,
             solver: Solver::Hold,
             start: Some(StartConfig::default()),
-            photometric: 0.0,
+            lambda_pg: 0.0,
             from_noise: Some(noise),
             ..SampleConfig::default()
         };
         fit.validate().unwrap();
         let found = fit.clone().without_start();
         found.validate().unwrap();
-        assert_eq!((found.steps, found.solver, found.photometric), (30, Solver::Multistep, 0.2));
+        assert_eq!((found.steps, found.solver, found.lambda_pg), (30, Solver::Multistep, 0.2));
         assert!(found.start.is_none());
         // What comes of it takes the place of a fit; what starts from a fit has no need.
         let mending = found.mending().unwrap();
         mending.validate().unwrap();
-        assert_eq!((mending.steps, mending.solver, mending.photometric), (3, Solver::Hold, 0.0));
+        assert_eq!((mending.steps, mending.solver, mending.lambda_pg), (3, Solver::Hold, 0.0));
         assert!(mending.start.is_some_and(|start| start.time == 0.0 && start.noise == 0.0));
         assert!(fit.mending().is_none());
         assert_eq!(found.clone().without_start(), found);

@@ -52,7 +52,7 @@ pub fn step(
         let gradient = match model.dit().gradient_channels() {
             true => {
                 let at = earlier.clone().filter(|_| config.gradient_at == GradientAt::Estimate);
-                Some(photometric.gradient(at.unwrap_or_else(|| noisy.clone()), &batch.hint)?)
+                Some(photometric.gradient(at.unwrap_or_else(|| noisy.clone()), &batch.gradient_targets)?)
             }
             false => None,
         };
@@ -63,7 +63,7 @@ pub fn step(
         let gradient = gradient.map(|g| scale_gradient(g, gradient_rms) * batch.conditional.clone());
         let observation = match &earlier {
             Some(earlier) if model.dit().observation_channels() => {
-                Some(photometric.observe(earlier.clone(), &batch.hint)?)
+                Some(photometric.observe(earlier.clone(), &batch.gradient_targets)?)
             }
             _ => None,
         };

@@ -12,9 +12,11 @@ use burn::{
     store::ModuleRecord,
     tensor::{Device, Tensor},
 };
-use freerange_data::{Generated, Object, ObjectSource, Shards, Split, Store, Stream};
+use freerange_build::Generated;
+use freerange_core::{sync_folder, sync_tree};
+use freerange_data::{Object, ObjectSource, Shards, Split, Store, Stream};
 use freerange_model::{Checkpoint, Compute, Dinov2, EncoderConfig, FreeRange, ModelConfig, WeightsOrigin};
-use freerange_splat::{Normalization, Statistics, channel, sync_folder, sync_tree};
+use freerange_splat::{Normalization, Statistics, channel};
 use rand::seq::index::sample as sample_indices;
 
 use crate::{
@@ -37,7 +39,7 @@ const NOT_FINITE_IN_A_ROW: u32 = 5;
 
 /// What is reported after a step.
 #[derive(Clone, Debug, serde::Serialize)]
-pub struct Report {
+pub struct StepReport {
     /// Steps taken so far, this one included.
     pub step: u64,
     /// Total loss.
@@ -189,28 +191,8 @@ impl Trainer {
             let theirs = checkpoint.model.encoder().dinov2().and_then(Dinov2::origin);
             require_same_encoder(theirs, origin.as_ref(), || "the initial checkpoint".into())?;
         }
-        let source: Arc<dyn ObjectSource> = match &config.data.shards {
-            Some(place) => {
-                let open = if config.data.partial { Shards::open_finished } else { Shards::open };
-                let shards = open(&Store::open(place)?, &config.depths(), Some(Split::Train))?;
-                Arc::new(shards.shuffled_by(config.seed))
-            }
-            None => Arc::new(generated(&config, 0)),
-        };
-        let validation = match config.validation.every {
-            0 => None,
-            _ => Some(match &config.data.shards {
-                Some(place) => {
-                    let open = if config.data.partial { Shards::open_finished } else { Shards::open };
-                    let shards = open(&Store::open(place)?, &config.depths(), Some(Split::Validation))?;
-                    Validation::new(&shards, shards.len() as u64, config.validation.objects, config.seed)?
-                }
-                None => {
-                    let other = generated(&config, 1 << 31); // farther than training comes
-                    Validation::new(&other, u64::MAX, config.validation.objects, config.seed)?
-                }
-            }),
-        };
+        let source = training_objects(&config)?;
+        let validation = validation_objects(&config)?;
         // Not before the data are there: a folder that holds a configuration belongs to a run.
         std::fs::create_dir_all(folder).map_err(|source| FlowError::Io { path: folder.into(), source })?;
         check_same_run(&config, folder)?;
@@ -219,70 +201,18 @@ impl Trainer {
             model = model.with_dinov2(&config.model, encoder)?;
         }
         // States and averages are of what is trained.
-        let (mut model, frozen) =
+        let (model, frozen) =
             model.with_compute(config.optimizer.compute).with_recompute(config.optimizer.recompute).take_dinov2();
-        let saved = latest_state(folder)?;
-        let (state, average, optimizer) = match &saved {
+        let State { model, average, optimizer, progress: state } = match latest_state(folder)? {
             Some(path) => {
                 progress(&format!("continuing from {}", path.display()));
-                let state = |name: &str| path.join(name);
-                let broken = |name: &str, e: String| FlowError::State { path: path.join(name), problem: e };
-                let record = |name: &str| ModuleRecord::load(state(name)).map_err(|e| broken(name, e.to_string()));
-                let average = model.clone().valid();
-                let average =
-                    average.try_load_record(record("average")?).map_err(|e| broken("average", e.to_string()))?;
-                model = model.try_load_record(record("model")?).map_err(|e| broken("model", e.to_string()))?;
-                let average = Weights::of(&average);
-                let optimizer = AdamW::load(&state("optimizer.safetensors"), &average, &plain)?;
-                let file = state("progress.json");
-                let text =
-                    std::fs::read_to_string(&file).map_err(|source| FlowError::Io { path: file.clone(), source })?;
-                let progress = serde_json::from_str::<Progress>(&text)
-                    .map_err(|e| FlowError::State { path: file.clone(), problem: e.to_string() })?;
-                let run = || format!("the run, in {}", file.display());
-                require_same_encoder(progress.encoder.as_ref(), origin.as_ref(), run)?;
-                (progress, average, optimizer)
+                State::load(&path, model, origin.as_ref(), &plain)?
             }
             None => {
-                if let Some(Initial { checkpoint, .. }) = initial {
-                    model = Weights::of(&checkpoint.model.clone().take_dinov2().0).apply(model);
-                }
-                let normalization = match initial {
-                    Some(Initial { checkpoint, remeasure: false }) => checkpoint.normalization.clone(),
-                    _ => {
-                        let count = config.data.statistics_objects as u64;
-                        let depth = config.stages.last().map_or(0, |s| s.depth);
-                        match source.statistics(depth) {
-                            Some(known) => known.normalization().map_err(freerange_data::DataError::from)?,
-                            None => {
-                                progress(&format!("measuring the statistics of {count} objects"));
-                                measure(source.as_ref(), count, depth)?
-                            }
-                        }
-                    }
-                };
-                // The gradient by normalised Gaussians grows with what they were divided by.
-                let square = |i: usize, old: &Checkpoint| {
-                    (old.gradient_rms[i] * normalization.std[i] / old.normalization.std[i]).powi(2)
-                };
-                let state = Progress {
-                    step: 0,
-                    seconds: 0.0,
-                    gradient_square: std::array::from_fn(|i| initial.map_or(0.0, |old| square(i, old.checkpoint))),
-                    inherited: initial.is_some(),
-                    normalization,
-                    first_object: Some(0),
-                    broken: 0,
-                    skipped: 0,
-                    best: None,
-                    encoder: origin,
-                };
-                let average = Weights::of(&model);
-                let optimizer = AdamW::new(average.0.len());
-                (state, average, optimizer)
+                let normalization = normalization(&config, initial, source.as_ref(), &mut progress)?;
+                State::begin(model, initial, normalization, origin)
             }
         };
-
         let first = state.first_object.unwrap_or(state.step * config.data.fresh as u64);
         let mut stream = Stream::start(source, first, config.data.workers);
         progress(&format!("filling the window with {} objects", config.data.window));
@@ -351,7 +281,7 @@ impl Trainer {
     /// Takes one step. A step whose loss or gradients are not finite changes no weights.
     ///
     /// After an error, too, [`save`](Self::save) keeps what was reached before it.
-    pub fn step(&mut self) -> Result<Report, FlowError> {
+    pub fn step(&mut self) -> Result<StepReport, FlowError> {
         let begin = Instant::now();
         let index = self.progress.step;
         let (stage, total_steps) = (self.config.stage(index).clone(), self.config.total_steps());
@@ -429,7 +359,7 @@ impl Trainer {
         if self.not_finite == NOT_FINITE_IN_A_ROW {
             return Err(FlowError::NotFinite { steps: self.not_finite, last: p.step, loss: total, norm });
         }
-        Ok(Report {
+        Ok(StepReport {
             step: self.progress.step,
             loss: total,
             flow,
@@ -560,6 +490,114 @@ impl Trainer {
             sum + steps * stage.batch as u64
         })
     }
+}
+
+/// All that a run changes.
+struct State {
+    model: FreeRange,
+    average: Weights,
+    optimizer: AdamW,
+    progress: Progress,
+}
+
+impl State {
+    /// The state saved in `path`, of a run whose frozen encoder is of `origin`.
+    fn load(path: &Path, model: FreeRange, origin: Option<&WeightsOrigin>, device: &Device) -> Result<Self, FlowError> {
+        let state = |name: &str| path.join(name);
+        let broken = |name: &str, e: String| FlowError::State { path: path.join(name), problem: e };
+        let record = |name: &str| ModuleRecord::load(state(name)).map_err(|e| broken(name, e.to_string()));
+        let average = model.clone().valid();
+        let average = average.try_load_record(record("average")?).map_err(|e| broken("average", e.to_string()))?;
+        let model = model.try_load_record(record("model")?).map_err(|e| broken("model", e.to_string()))?;
+        let average = Weights::of(&average);
+        let optimizer = AdamW::load(&state("optimizer.safetensors"), &average, device)?;
+        let file = state("progress.json");
+        let text = std::fs::read_to_string(&file).map_err(|source| FlowError::Io { path: file.clone(), source })?;
+        let progress = serde_json::from_str::<Progress>(&text)
+            .map_err(|e| FlowError::State { path: file.clone(), problem: e.to_string() })?;
+        let run = || format!("the run, in {}", file.display());
+        require_same_encoder(progress.encoder.as_ref(), origin, run)?;
+        Ok(Self { model, average, optimizer, progress })
+    }
+
+    /// That of a new run.
+    fn begin(
+        mut model: FreeRange,
+        initial: Option<Initial>,
+        normalization: Normalization,
+        encoder: Option<WeightsOrigin>,
+    ) -> Self {
+        if let Some(Initial { checkpoint, .. }) = initial {
+            model = Weights::of(&checkpoint.model.clone().take_dinov2().0).apply(model);
+        }
+        // The gradient by normalised Gaussians grows with what they were divided by.
+        let square = |i: usize, old: &Checkpoint| {
+            (old.gradient_rms[i] * normalization.std[i] / old.normalization.std[i]).powi(2)
+        };
+        let progress = Progress {
+            step: 0,
+            seconds: 0.0,
+            gradient_square: std::array::from_fn(|i| initial.map_or(0.0, |old| square(i, old.checkpoint))),
+            inherited: initial.is_some(),
+            normalization,
+            first_object: Some(0),
+            broken: 0,
+            skipped: 0,
+            best: None,
+            encoder,
+        };
+        let average = Weights::of(&model);
+        let optimizer = AdamW::new(average.0.len());
+        Self { model, average, optimizer, progress }
+    }
+}
+
+/// What a new run normalises Gaussians by.
+fn normalization(
+    config: &TrainConfig,
+    initial: Option<Initial>,
+    source: &dyn ObjectSource,
+    progress: &mut impl FnMut(&str),
+) -> Result<Normalization, FlowError> {
+    if let Some(Initial { checkpoint, remeasure: false }) = initial {
+        return Ok(checkpoint.normalization.clone());
+    }
+    let count = config.data.statistics_objects as u64;
+    let depth = config.stages.last().map_or(0, |s| s.depth);
+    match source.statistics(depth) {
+        Some(known) => Ok(known.normalization().map_err(freerange_data::DataError::from)?),
+        None => {
+            progress(&format!("measuring the statistics of {count} objects"));
+            measure(source, count, depth)
+        }
+    }
+}
+
+/// The part `split` of the shards at `place`.
+fn shards(config: &TrainConfig, place: &str, split: Split) -> Result<Shards, FlowError> {
+    let open = if config.data.partial { Shards::open_finished } else { Shards::open };
+    Ok(open(&Store::open(place)?, &config.depths(), Some(split))?)
+}
+
+fn training_objects(config: &TrainConfig) -> Result<Arc<dyn ObjectSource>, FlowError> {
+    Ok(match &config.data.shards {
+        Some(place) => Arc::new(shards(config, place, Split::Train)?.shuffled_by(config.seed)),
+        None => Arc::new(generated(config, 0)),
+    })
+}
+
+/// Those to measure on, if anything is to be measured.
+fn validation_objects(config: &TrainConfig) -> Result<Option<Validation>, FlowError> {
+    let count = config.validation.objects;
+    Ok(match (config.validation.every, &config.data.shards) {
+        (0, _) => None,
+        (_, Some(place)) => {
+            let shards = shards(config, place, Split::Validation)?;
+            Some(Validation::new(&shards, shards.len() as u64, count, config.seed)?)
+        }
+        // Farther than training comes.
+        (_, None) => Some(Validation::new(&generated(config, 1 << 31), u64::MAX, count, config.seed)?),
+    })
 }
 
 /// Objects made on the fly, from the run's seeds on or so many farther.

@@ -3,8 +3,9 @@
 use std::{ops::ControlFlow, sync::Arc};
 
 use burn::tensor::{Device, Tensor};
+use freerange_build::psnr_over_white;
 use freerange_camera::View;
-use freerange_data::{Object, ObjectSource, psnr_over_white};
+use freerange_data::{Object, ObjectSource};
 use freerange_model::{Checkpoint, FreeRange, ModelConfig};
 use freerange_splat::{Cloud, channel};
 

@@ -5,7 +5,7 @@ use std::{collections::HashMap, path::PathBuf};
 use burn::tensor::{Device, Tensor, TensorData};
 use freerange_flow::{
     path::{cosine_time, flow_loss, interpolate, render_weight},
-    sample::{Solver, classifier_free, integrate},
+    sample::{SampleConfig, Solver, classifier_free, integrate},
 };
 use freerange_splat::{Cloud, Normalization};
 
@@ -126,8 +126,8 @@ fn euler_with_both_guidances_on_the_toy_model() {
             },
             // The reference's result is the last estimate, without a push.
             |step, estimate| {
-                let push = (estimate.clone() - target.clone()).mul_scalar(kappa * lambda);
-                Ok((step.index + 1 < steps).then_some(push))
+                let displacement = (estimate.clone() - target.clone()).mul_scalar(kappa * lambda);
+                Ok((step.index + 1 < steps).then_some(displacement))
             },
         )
         .unwrap();
@@ -155,4 +155,19 @@ fn toy_cases() -> Vec<(String, usize, f32, f32, f32)> {
             (format!("sampler{i}.safetensors"), number("steps") as usize, number("s"), number("lam"), number("kappa"))
         })
         .collect()
+}
+
+/// It was written when the scales had other names.
+#[test]
+fn the_shipped_checkpoints_settings_are_understood() {
+    let path = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../checkpoints/tiny.safetensors"));
+    let bytes = std::fs::read(path).unwrap();
+    let (_, header) = safetensors::SafeTensors::read_metadata(&bytes).unwrap();
+    let provenance = &header.metadata().as_ref().unwrap()["provenance"];
+    let provenance: serde_json::Value = serde_json::from_str(provenance).unwrap();
+    let said = &provenance["sample"];
+    let number = |now: &str, then: &str| said.get(now).or(said.get(then)).unwrap().as_f64().unwrap() as f32;
+    let found: SampleConfig = serde_json::from_value(said.clone()).unwrap();
+    assert_eq!(found.cfg_scale, number("cfg_scale", "guidance"));
+    assert_eq!(found.lambda_pg, number("lambda_pg", "photometric"));
 }

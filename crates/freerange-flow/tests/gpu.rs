@@ -2,7 +2,8 @@
 #![cfg(any(feature = "cuda", feature = "metal", feature = "vulkan", feature = "webgpu"))]
 
 use burn::tensor::{Device, DeviceType, Tensor};
-use freerange_data::{Generated, Object, ObjectSource};
+use freerange_build::Generated;
+use freerange_data::{Object, ObjectSource};
 use freerange_flow::{
     batch::{Batch, step_rng},
     config::TrainConfig,

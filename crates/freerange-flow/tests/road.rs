@@ -3,8 +3,9 @@
 use std::{ops::ControlFlow, sync::Arc};
 
 use burn::tensor::Device;
+use freerange_build::Generated;
 use freerange_camera::{View, image_ops::composite};
-use freerange_data::{Generated, ObjectSource};
+use freerange_data::ObjectSource;
 use freerange_flow::{
     FlowError,
     batch::{Batch, step_rng},
@@ -151,9 +152,9 @@ fn one_object_is_learned_sampled_and_rendered() {
         (0.1, PhotometricStep::Scaled, 1, Some(16)),
         (0.1, PhotometricStep::Scaled, 1, Some(32)),
     ];
-    let sampled = ways.map(|(photometric, photometric_step, photometric_repeats, photometric_size)| {
+    let sampled = ways.map(|(lambda_pg, photometric_step, photometric_repeats, photometric_size)| {
         let guidance = SampleConfig {
-            photometric,
+            lambda_pg,
             photometric_step,
             photometric_repeats,
             photometric_size,
@@ -168,8 +169,8 @@ fn one_object_is_learned_sampled_and_rendered() {
     assert_eq!(sampled[5], sampled[2], "gradient_size is what a left out photometric_size means");
 
     // A single step is guided, too: its result is.
-    let single = |photometric: f32| {
-        let one = SampleConfig { steps: 1, photometric, ..config.sample.clone() };
+    let single = |lambda_pg: f32| {
+        let one = SampleConfig { steps: 1, lambda_pg, ..config.sample.clone() };
         reconstruct(&checkpoint, &[inputs], None, &one, &[5], &device, go).unwrap().remove(0).remove(0)
     };
     assert_ne!(single(0.0), single(50.0));
@@ -286,7 +287,11 @@ fn a_moved_frame_changes_nothing_that_is_seen() {
         let loss = |batch: &Batch, targets: &Targets| {
             photometric.l1(batch.data.clone(), targets).unwrap().into_data().try_to_vec::<f32>().unwrap()[0]
         };
-        for (x, y) in [(&a.seen, &b.seen), (&a.hint, &b.hint), (a.held.as_ref().unwrap(), b.held.as_ref().unwrap())] {
+        for (x, y) in [
+            (&a.seen, &b.seen),
+            (&a.gradient_targets, &b.gradient_targets),
+            (a.held.as_ref().unwrap(), b.held.as_ref().unwrap()),
+        ] {
             let (x, y) = (loss(&a, x), loss(&b, y));
             assert!((x - y).abs() < 1e-3 * x, "seed {seed}: {x} {y}");
         }
@@ -379,7 +384,7 @@ fn a_fit_is_mended() {
         found > from + 0.4 * (to - from) && to > from + 1.0,
         "fit {from:.2} dB, mended {found:.2} dB, at best {to:.2} dB"
     );
-    // A photometric push moves what is fed back.
-    let pushed = sample(&[5], &SampleConfig { photometric: 0.05, ..white }, &mut steps);
+    // Photometric guidance moves what is fed back.
+    let pushed = sample(&[5], &SampleConfig { lambda_pg: 0.05, ..white }, &mut steps);
     assert_ne!(pushed[0], clouds[0]);
 }

@@ -29,7 +29,8 @@ pub mod viewer;
 
 use std::{fmt, fs::File, io::Read, io::Write, path::Path};
 
-use freerange_splat::{Cloud, SplatError, encode_ply, parse_ply, write_atomically};
+use freerange_core::write_atomically;
+use freerange_splat::{Cloud, SplatError, encode_ply, parse_ply};
 use glam::DVec3;
 
 pub use error::FormatError;

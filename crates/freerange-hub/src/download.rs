@@ -6,11 +6,12 @@ use std::{
     time::Duration,
 };
 
+use freerange_core::hex;
 use serde::Deserialize;
 use sha2::{Digest, Sha256};
 use tempfile::NamedTempFile;
 
-use crate::{Hub, HubError, HubModel, Pins, hexadecimal, is_commit, write};
+use crate::{Hub, HubError, HubModel, Pins, is_commit, write};
 
 /// Longest answer that is no file, in bytes.
 const ANSWER_LIMIT: u64 = 8 << 20;
@@ -130,7 +131,7 @@ fn fetch(
         progress(name, done, size);
     }
     match done == size {
-        true => Ok((file, hexadecimal(&hash.finalize()))),
+        true => Ok((file, hex(&hash.finalize()))),
         false => {
             Err(failed(url, format!("expected {size} bytes, {} came", if done > size { "more" } else { "fewer" })))
         }

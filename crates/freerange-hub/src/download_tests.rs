@@ -50,7 +50,7 @@ impl Server {
 
     /// A repository `a/b` whose branch `main` is at `commit`, with these weights.
     fn publish(&self, commit: &str, weights: &[u8]) {
-        let sha256 = hexadecimal(&Sha256::digest(weights));
+        let sha256 = hex(&Sha256::digest(weights));
         self.put("/api/models/a/b/revision/main", format!("{{\"sha\":\"{commit}\",\"id\":\"a/b\"}}"));
         let tree = format!(
             "[{{\"type\":\"file\",\"path\":\"config.json\",\"size\":2,\"oid\":\"x\"}},\

@@ -14,13 +14,13 @@ use std::{
     collections::BTreeMap,
     fmt,
     fs::File,
-    io::{self, Read, Write},
+    io::{self, Write},
     path::{Path, PathBuf},
     str::FromStr,
 };
 
+use freerange_core::sha256_of;
 use serde::{Deserialize, Serialize};
-use sha2::{Digest, Sha256};
 
 pub use error::HubError;
 
@@ -177,34 +177,18 @@ fn read_pins(folder: &Path) -> Result<Pins, HubError> {
 /// Whether a file is there with the hash that was pinned.
 fn is_whole(path: &Path, pinned: Option<&String>) -> Result<bool, HubError> {
     let Some(pinned) = pinned else { return Ok(false) };
-    match File::open(path).and_then(|mut file| hash(&mut file)) {
+    match File::open(path).and_then(|mut file| sha256_of(&mut file)) {
         Ok(found) => Ok(found == *pinned),
         Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(false),
         Err(source) => Err(HubError::Io { path: path.into(), source }),
     }
 }
 
-/// SHA-256, hexadecimal.
-fn hash(from: &mut impl Read) -> io::Result<String> {
-    let mut hash = Sha256::new();
-    io::copy(from, &mut hash)?;
-    Ok(hexadecimal(&hash.finalize()))
-}
-
-fn hexadecimal(bytes: &[u8]) -> String {
-    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
-}
-
 /// Writes a file whole or not at all; folders are made.
 fn write(path: &Path, bytes: &[u8]) -> Result<(), HubError> {
     let folder = path.parent().unwrap_or(Path::new("."));
-    let written = std::fs::create_dir_all(folder).and_then(|()| {
-        let mut file = tempfile::NamedTempFile::new_in(folder)?;
-        file.write_all(bytes)?;
-        file.as_file().sync_all()?;
-        file.persist(path)?;
-        Ok(())
-    });
+    let written = std::fs::create_dir_all(folder)
+        .and_then(|()| freerange_core::write_atomically(path, |file| file.write_all(bytes)));
     written.map_err(|source| HubError::Io { path: path.into(), source })
 }
 
@@ -245,7 +229,7 @@ mod tests {
         let place = folder.path().join("hub/a/b");
         write(&place.join("refs/main"), commit.as_bytes()).unwrap();
         let mut pins = Pins::default();
-        pins.sha256.insert("model.safetensors".into(), hash(&mut &bytes[..]).unwrap());
+        pins.sha256.insert("model.safetensors".into(), sha256_of(&mut &bytes[..]).unwrap());
         write(&place.join(commit).join("pins.json"), &serde_json::to_vec(&pins).unwrap()).unwrap();
         let file = place.join(commit).join("model.safetensors");
         write(&file, bytes).unwrap();

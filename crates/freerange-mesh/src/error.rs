@@ -1,16 +1,11 @@
+use freerange_core::{Invalid, IoError};
+
 /// What can be wrong with a configuration or a mesh.
 #[derive(Debug, thiserror::Error)]
 pub enum MeshError {
     /// A configuration value out of its range.
-    #[error("{field}: expected {expected}, found {found}")]
-    Config {
-        /// Name of the field.
-        field: &'static str,
-        /// What is allowed.
-        expected: &'static str,
-        /// What was given.
-        found: String,
-    },
+    #[error(transparent)]
+    Config(#[from] Invalid),
     /// A mesh whose arrays do not fit together.
     #[error("mesh {field}: expected {expected}, found {found}")]
     Mesh {
@@ -22,13 +17,8 @@ pub enum MeshError {
         found: String,
     },
     /// A file that cannot be opened or read.
-    #[error("cannot read {path}: {source}")]
-    Io {
-        /// The file.
-        path: std::path::PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    Io(#[from] IoError),
     /// A file whose content breaks its format or a limit of [`LoadLimits`](crate::LoadLimits).
     #[error("{path}: {field}: expected {expected}, found {found}")]
     File {
@@ -49,14 +39,4 @@ pub enum MeshError {
         /// What it needs, and what helps.
         what: String,
     },
-}
-
-/// Fails unless `ok`.
-pub(crate) fn check(
-    ok: bool,
-    field: &'static str,
-    expected: &'static str,
-    found: impl std::fmt::Debug,
-) -> Result<(), MeshError> {
-    if ok { Ok(()) } else { Err(MeshError::Config { field, expected, found: format!("{found:?}") }) }
 }

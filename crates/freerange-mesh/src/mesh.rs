@@ -85,7 +85,7 @@ impl Mesh {
 
     /// How much of what lies behind a point of triangle `i` is hidden, within [0, 1]; `bary` weighs its second and third
     /// corner.
-    pub(crate) fn opacity(&self, i: usize, bary: Vec2) -> f32 {
+    pub fn opacity(&self, i: usize, bary: Vec2) -> f32 {
         let material = &self.materials[usize::from(self.triangle_materials[i])];
         if material.alpha == AlphaMode::Opaque {
             return 1.0;
@@ -98,7 +98,7 @@ impl Mesh {
     }
 
     /// The vertex colour at a point given by its weights; white without vertex colours.
-    pub(crate) fn tint(&self, corners: [usize; 3], weights: [f32; 3]) -> Vec4 {
+    pub fn tint(&self, corners: [usize; 3], weights: [f32; 3]) -> Vec4 {
         if self.colors.is_empty() {
             return Vec4::ONE;
         }
@@ -106,14 +106,14 @@ impl Mesh {
     }
 
     /// Rotates about the origin; `rest` stays.
-    pub(crate) fn rotate(&mut self, rotation: Quat) {
+    pub fn rotate(&mut self, rotation: Quat) {
         for v in self.positions.iter_mut().chain(&mut self.normals) {
             *v = rotation * *v;
         }
     }
 
     /// Centres the bounding box at the origin and scales the farthest vertex to distance 0.5.
-    pub(crate) fn normalize(&mut self) {
+    pub fn normalize(&mut self) {
         let (lo, hi) = self
             .positions
             .iter()

@@ -30,6 +30,7 @@ impl Frame {
 
 /// What the pattern is. Colours are linear.
 #[derive(Clone, Debug)]
+#[allow(missing_docs, reason = "colours and sizes of what the line above each names")]
 pub enum Form {
     /// Strands over and under each other: `float` strands are passed at a time (1 is plain weave, 2 twill).
     Weave { warp: Vec3, weft: Vec3, gap: Vec3, float: i32, thin: f32 },
@@ -54,20 +55,27 @@ pub enum Form {
 /// A flat or solid pattern over the surface.
 #[derive(Clone, Debug)]
 pub struct Pattern {
-    pub(crate) frame: Frame,
-    pub(crate) form: Form,
-    pub(crate) seed: u32,
+    /// Where its two coordinates come from.
+    pub frame: Frame,
+    /// What it is.
+    pub form: Form,
+    /// Noise seed.
+    pub seed: u32,
 }
 
 /// Stains, dust towards the foot, and scratches over another texture.
 #[derive(Clone, Debug)]
 pub struct Wear {
-    pub(crate) base: Texture,
-    pub(crate) dirt: Vec3,
+    /// What is worn.
+    pub base: Texture,
+    /// Colour of the dirt.
+    pub dirt: Vec3,
     /// Strength of stains, of the dirt near the foot, and of scratches, each 0 to 1.
-    pub(crate) amounts: Vec3,
-    pub(crate) scale: f32,
-    pub(crate) seed: u32,
+    pub amounts: Vec3,
+    /// Stains per unit.
+    pub scale: f32,
+    /// Noise seed.
+    pub seed: u32,
 }
 
 fn hash(x: f32, y: f32, seed: u32) -> f32 {

@@ -37,7 +37,7 @@ impl Raster {
     }
 
     /// A picture of sRGB-encoded pixels, row 0 at the top. Both sides are at least 1.
-    pub(crate) fn from_encoded(width: usize, height: usize, pixels: Vec<[u8; 4]>) -> Self {
+    pub fn from_encoded(width: usize, height: usize, pixels: Vec<[u8; 4]>) -> Self {
         debug_assert_eq!(pixels.len(), width * height);
         Self { width, height, pixels }
     }
@@ -412,7 +412,7 @@ impl Material {
     }
 
     /// True if some property comes from a picture of a file.
-    pub(crate) fn has_pictures(&self) -> bool {
+    pub fn has_pictures(&self) -> bool {
         matches!(self.texture, Texture::Image(_))
             || self.metallic_roughness.is_some()
             || self.normal_map.is_some()

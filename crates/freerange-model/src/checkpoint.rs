@@ -11,7 +11,8 @@ use std::{
 };
 
 use burn::tensor::{Device, f16};
-use freerange_splat::{Normalization, channel, write_atomically};
+use freerange_core::write_atomically;
+use freerange_splat::{Normalization, channel};
 use safetensors::{Dtype, tensor::TensorView};
 
 use crate::{

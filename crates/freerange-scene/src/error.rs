@@ -96,7 +96,7 @@ pub enum SceneError {
         advice: &'static str,
     },
     /// An image is not there.
-    #[error("{place}: no image {} (looked in {})", image.display(), folders.join(", "))]
+    #[error("{place}: no image {} (looked in {}; --images FOLDER says where else)", image.display(), folders.join(", "))]
     MissingImage {
         /// The file and place that name it.
         place: String,

@@ -8,6 +8,9 @@ use std::path::PathBuf;
 
 /// Agreement of a mask with the common hull below which it is pointed out.
 const DOUBTFUL: f64 = 0.8;
+/// Contradiction of a mask and the others above which it is pointed out: true masks of generated objects have less than 0.001, one in
+/// another's place mostly 0.04 to 0.7.
+const CONTRADICTS: f64 = 0.03;
 /// Gap between cameras around the object that is pointed out, in degrees.
 const WIDE_GAP: f64 = 140.0;
 
@@ -59,6 +62,8 @@ pub struct ViewReport {
     pub covers: f64,
     /// How far the mask agrees with the hull of all masks, 0 to 1.
     pub agreement: f64,
+    /// How far the mask and those of the others contradict each other, 0 to 1 ([`estimate::contradictions`]); 0 for two views.
+    pub contradicts: f64,
     /// Whether the mask reaches the image's border.
     pub cut_off: bool,
     /// Whether the model is shown this view.
@@ -67,12 +72,22 @@ pub struct ViewReport {
     pub reason: String,
 }
 
+impl ViewReport {
+    fn doubtful(&self) -> bool {
+        self.agreement < DOUBTFUL || self.contradicts > CONTRADICTS
+    }
+}
+
 /// Looks at a scene. `frame`: where the object was found; `shown`: which views the model is shown.
 pub fn inspect(cameras: &Cameras, loaded: &Loaded, frame: &CanonicalFrame, shown: &[usize]) -> Inspection {
     let back = frame.canonical_from_user.inverse();
     let (centre, radius) = (back.apply(DVec3::ZERO), CANONICAL_RADIUS * back.scale);
     let up = back.rotation * DVec3::Z;
     let agreement = estimate::agreement(&loaded.views, centre, 1.5 * radius);
+    let contradicts = match loaded.views.len() {
+        0..3 => vec![0.0; loaded.views.len()],
+        _ => estimate::contradictions(&loaded.views, centre, 1.5 * radius),
+    };
     let to_up = DQuat::from_rotation_arc(up, DVec3::Z);
     let views: Vec<ViewReport> = loaded
         .views
@@ -94,6 +109,7 @@ pub fn inspect(cameras: &Cameras, loaded: &Loaded, frame: &CanonicalFrame, shown
                 elevation: (from.z / from.length()).asin().to_degrees(),
                 covers: covered as f64 / alpha.len().max(1) as f64,
                 agreement: agreement[i],
+                contradicts: contradicts[i],
                 cut_off: estimate::cut_off(&alpha, c.width, c.height),
                 shown: is_shown,
                 reason: match (is_shown, shown.len() == loaded.views.len()) {
@@ -159,7 +175,10 @@ fn warnings(views: &[ViewReport], sureness: Option<f64>) -> Vec<String> {
     if let Some(names) = listed(views, |v| v.cut_off) {
         warnings.push(format!("the object is cut off by the photo's border in {names}"));
     }
-    if let Some(names) = listed(views, |v| v.agreement < DOUBTFUL) {
+    // A wrong mask takes from all others: what contradicts them most is named.
+    let most = views.iter().map(|v| v.contradicts).fold(CONTRADICTS, f64::max);
+    let worst = |v: &ViewReport| v.contradicts > CONTRADICTS && v.contradicts >= 0.9 * most;
+    if let Some(names) = listed(views, |v| worst(v) || (most <= CONTRADICTS && v.doubtful())) {
         warnings.push(format!("the masks of the other views disagree with {names}: a mask or a pose is wrong there"));
     }
     if let Some(names) = listed(views, |v| v.covers < 0.01) {
@@ -212,7 +231,7 @@ pub fn sheet(loaded: &Loaded, inspection: &Inspection) -> RgbaImage {
         let (x, y) = (place % columns * TILE, head + place / columns * (TILE + 2 * LINE));
         let picture = tile(view, &loaded.whole[i], report, centre, radius);
         image::imageops::overlay(&mut sheet, &picture, i64::from(x), i64::from(y + LINE));
-        let ink = if report.agreement < DOUBTFUL || report.cut_off { RED } else { INK };
+        let ink = if report.doubtful() || report.cut_off { RED } else { INK };
         let line = format!(
             "{place} {}: {} AGREES {:.0} %{}",
             report.name,

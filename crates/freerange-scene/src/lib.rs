@@ -9,7 +9,9 @@ mod error;
 pub mod estimate;
 pub mod inspect;
 mod load;
+#[cfg(feature = "mask-model")]
+mod network;
 pub mod read;
 
 pub use error::SceneError;
-pub use load::{LoadConfig, Loaded, MaskKind, MaskSource, load, up_of, write_masks};
+pub use load::{LoadConfig, Loaded, MaskKind, MaskModel, MaskSource, PixelRange, files, load, up_of, write_masks};

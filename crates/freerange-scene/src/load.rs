@@ -10,7 +10,7 @@ use freerange_camera::{Camera, Lens, Up, View, image_ops::resize_area, scene::cu
 use image::{DynamicImage, GrayImage, ImageDecoder, ImageReader, Luma, Rgba, RgbaImage, metadata::Orientation};
 use rayon::prelude::*;
 use std::{
-    collections::HashSet,
+    collections::{BTreeSet, HashSet},
     path::{Path, PathBuf},
 };
 
@@ -34,6 +34,49 @@ pub enum MaskSource {
     Files(PathBuf),
     /// Poses and colours alone ([`estimate`]).
     Estimate,
+    /// A network of the user's own.
+    Model(MaskModel),
+}
+
+/// A segmentation network: an ONNX file with one input, `[1, 3, height, width]`, whose first output is the object's share of each pixel,
+/// `[1, 1, height, width]`: from 0 to 1, or log odds if any number is beyond that. Photos are scaled to its size, whatever their shape; to
+/// 320 x 320 where it takes any.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct MaskModel {
+    /// The file.
+    pub file: PathBuf,
+    /// What it takes for pixels.
+    pub pixels: PixelRange,
+}
+
+/// What networks take for the red, green and blue of a pixel.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum PixelRange {
+    /// 0 to 1, minus ImageNet's mean, divided by its standard deviation: U2-Net, BiRefNet and most others.
+    #[default]
+    Imagenet,
+    /// 0 to 1.
+    Unit,
+    /// -0.5 to 0.5: IS-Net.
+    Centered,
+    /// -1 to 1.
+    Signed,
+}
+
+impl PixelRange {
+    /// All, by their names in options.
+    pub const ALL: [(&'static str, Self); 4] =
+        [("imagenet", Self::Imagenet), ("unit", Self::Unit), ("centered", Self::Centered), ("signed", Self::Signed)];
+
+    /// What is subtracted from values of 0 to 1, and what they are divided by then; red, green, blue.
+    pub fn mean_and_deviation(self) -> ([f32; 3], [f32; 3]) {
+        match self {
+            Self::Imagenet => ([0.485, 0.456, 0.406], [0.229, 0.224, 0.225]),
+            Self::Unit => ([0.0; 3], [1.0; 3]),
+            Self::Centered => ([0.5; 3], [1.0; 3]),
+            Self::Signed => ([0.5; 3], [0.5; 3]),
+        }
+    }
 }
 
 /// How the object was told from the rest.
@@ -48,6 +91,8 @@ pub enum MaskKind {
     Files,
     /// Poses and colours.
     Estimate,
+    /// A network.
+    Model,
 }
 
 /// How photos become views.
@@ -167,6 +212,21 @@ pub fn load(cameras: &Cameras, config: &LoadConfig) -> Result<Loaded, SceneError
     Ok(Loaded { views, photos: inputs, whole, further, masks: kind, estimate, notes })
 }
 
+/// The files that [`load`] reads: of cameras, photos and masks; each once, sorted. None of them is opened.
+pub fn files(cameras: &Cameras, config: &LoadConfig) -> Result<Vec<PathBuf>, SceneError> {
+    let inputs: Vec<usize> = (0..cameras.photos.len()).filter(|i| !cameras.photos[*i].further).collect();
+    let masks = mask_files(&cameras.photos, &inputs, config)?.into_iter().flatten();
+    let further = cameras.photos.iter().filter(|p| p.further).filter_map(|p| p.mask.clone());
+    let photos = cameras.photos.iter().map(|p| p.image.clone());
+    let network = match &config.masks {
+        MaskSource::Model(model) => Some(model.file.clone()),
+        _ => None,
+    };
+    let files = cameras.files.iter().cloned().chain(photos).chain(masks).chain(further).chain(network);
+    let all: BTreeSet<PathBuf> = files.collect();
+    Ok(all.into_iter().collect())
+}
+
 fn opaque(image: &RgbaImage) -> bool {
     image.pixels().all(|p| p[3] == 255)
 }
@@ -194,6 +254,14 @@ fn cut_all(
         }
         notes.push("masks are read from files".into());
         return Ok((MaskKind::Files, None));
+    }
+    if let MaskSource::Model(model) = &config.masks {
+        let found = network(model, views)?;
+        for (view, alpha) in views.iter_mut().zip(found) {
+            set_alpha(&mut view.image, &alpha);
+        }
+        notes.push(format!("the object was cut out by {}", model.file.display()));
+        return Ok((MaskKind::Model, None));
     }
     let auto = config.masks == MaskSource::Auto;
     if config.masks != MaskSource::Estimate {
@@ -240,6 +308,17 @@ fn cut_all(
     ));
     notes.extend(estimate.notes.clone());
     Ok((MaskKind::Estimate, Some(estimate)))
+}
+
+#[cfg(feature = "mask-model")]
+fn network(model: &MaskModel, views: &[View]) -> Result<Vec<Vec<u8>>, SceneError> {
+    crate::network::masks(model, views)
+}
+
+#[cfg(not(feature = "mask-model"))]
+fn network(model: &MaskModel, _: &[View]) -> Result<Vec<Vec<u8>>, SceneError> {
+    let expected = format!("a program built with --features mask-model, to run {}", model.file.display());
+    Err(SceneError::Option { option: "--mask-model", expected, found: "one without".into() })
 }
 
 fn set_alpha(image: &mut RgbaImage, alpha: &[u8]) {

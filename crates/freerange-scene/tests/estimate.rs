@@ -3,13 +3,15 @@
 use freerange_camera::{Camera, View};
 use freerange_scene::{
     LoadConfig, MaskSource, SceneError,
-    estimate::{Hints, agreement, masks, overlap, table_faces},
+    estimate::{Hints, agreement, contradictions, masks, overlap, table_faces},
     load,
     read::cameras,
 };
 use glam::DVec3;
 use image::{Rgba, RgbaImage};
 use std::path::PathBuf;
+
+mod tabletop;
 
 const W: u32 = 240;
 const H: u32 = 180;
@@ -131,7 +133,9 @@ fn the_same_photos_give_the_same_masks() {
 fn refused(views: &[View], words: &[&str]) {
     let text = match masks(views, &Hints::default()) {
         Err(e @ SceneError::NotCutOut { .. }) => e.to_string(),
-        other => panic!("expected a refusal, found {:?}", other.map(|e| (e.agreement.clone(), e.sureness()))),
+        other => {
+            panic!("expected a refusal, found {:?}", other.map(|e| (e.agreement.clone(), e.sureness(), e.evidence)))
+        }
     };
     words.iter().for_each(|w| assert!(text.contains(w), "expected {w:?} in: {text}"));
 }
@@ -149,6 +153,59 @@ fn views_that_contradict_each_other_are_refused() {
         .collect();
     refused(&away, &["common point"]);
     refused(&views[..2], &["at least 3 views"]);
+    // Photos under each other's poses: all, and two of them.
+    for order in [[3, 6, 1, 4, 7, 2, 0, 5], [1, 2, 3, 4, 5, 6, 7, 0], [4, 1, 2, 3, 0, 5, 6, 7]] {
+        let mixed: Vec<View> =
+            views.iter().zip(order).map(|(v, j)| View { camera: views[j].camera, ..v.clone() }).collect();
+        refused(&mixed, &["contradict each other", "poses may be wrong"]);
+    }
+}
+
+#[test]
+fn a_mask_in_anothers_place_is_told() {
+    let (views, truth) = scene();
+    let cut = |order: [usize; 8]| -> Vec<f64> {
+        let cut: Vec<View> = views
+            .iter()
+            .zip(order)
+            .map(|(v, j)| {
+                let mut v = v.clone();
+                v.image.pixels_mut().zip(&truth[j]).for_each(|(p, m)| p[3] = if *m { 255 } else { 0 });
+                v
+            })
+            .collect();
+        contradictions(&cut, DVec3::new(0.0, 0.0, 0.13), 0.4)
+    };
+    let most = |v: &[f64]| v.iter().copied().fold(0.0, f64::max);
+    let right = cut([0, 1, 2, 3, 4, 5, 6, 7]);
+    assert!(most(&right) < 0.02, "{right:?}");
+    for (wrong, order) in [(2, [0, 1, 6, 3, 4, 5, 6, 7]), (5, [0, 1, 2, 3, 4, 1, 6, 7])] {
+        let found = cut(order);
+        assert!(found[wrong] > 0.06 && found[wrong] == most(&found), "{wrong}: {found:?}");
+    }
+}
+
+/// Generated objects on tables of all kinds: what right poses give and wrong ones do not.
+#[test]
+fn generated_scenes_tell_right_poses_from_wrong_ones() {
+    for seed in [301, 302, 304] {
+        let scene = tabletop::tabletop(seed, 6, std::f64::consts::TAU, (240, 180));
+        let found = masks(&scene.views, &Hints::default());
+        assert!(found.is_ok(), "{}: {:?}", scene.what, found.err());
+        let order = [2, 4, 5, 1, 3, 0];
+        let mixed: Vec<View> = scene
+            .views
+            .iter()
+            .zip(order)
+            .map(|(v, j)| {
+                let mut v = v.clone();
+                v.camera.world_to_camera = scene.views[j].camera.world_to_camera;
+                v
+            })
+            .collect();
+        let found = masks(&mixed, &Hints::default());
+        assert!(matches!(found, Err(SceneError::NotCutOut { .. })), "{}: {:?}", scene.what, found.map(|e| e.evidence));
+    }
 }
 
 /// Photo-like scenes with true masks.

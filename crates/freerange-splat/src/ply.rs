@@ -8,7 +8,8 @@
 use crate::cloud::Row;
 use crate::ply_compressed;
 use crate::ply_header::{Element, Format, Header, Kind, Property, Scalar, read_header};
-use crate::{Cloud, SplatError, channel, write_atomically};
+use crate::{Cloud, SplatError, channel};
+use freerange_core::write_atomically;
 use std::io::{self, BufRead, BufReader, Read, Write};
 use std::{fs::File, path::Path};
 

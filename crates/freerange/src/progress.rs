@@ -53,7 +53,7 @@ pub struct Progress<'a> {
     pub total: usize,
     /// The photometric loss of the last step of a fit or a refinement.
     pub loss: Option<f64>,
-    pub(crate) estimate: Option<(Known<'a>, Place<'a>)>,
+    pub(crate) estimate: Option<(Known<'a>, &'a Similarity)>,
 }
 
 /// What is known of the Gaussians at a step.
@@ -65,14 +65,6 @@ pub(crate) enum Known<'a> {
     Sampled(&'a Estimate<'a>),
 }
 
-/// Where they are.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Place<'a> {
-    /// To the canonical frame, from that of a member of an ensemble.
-    pub back: &'a Similarity,
-    pub canonical_from_user: &'a Similarity,
-}
-
 impl<'a> Progress<'a> {
     pub(crate) fn new(stage: Stage, done: usize, total: usize) -> Self {
         Self { stage, sample: 0, done, total, loss: None, estimate: None }
@@ -80,7 +72,8 @@ impl<'a> Progress<'a> {
 
     /// What the Gaussians are by now, in the frame of the views: the state of a fit, one cloud, which all samples start from; while sampling,
     /// what the network takes the clean Gaussians of each sample to be; while refining, the state of sample [`Progress::sample`], one cloud.
-    /// None when a stage begins. Costs a copy; on a GPU it waits for the step. Whether it is called changes no result.
+    /// None when a stage begins, and for the other members of an ensemble. Costs a copy; on a GPU it waits for the step. Whether it
+    /// is called changes no result.
     ///
     /// # Errors
     /// If a device fails.
@@ -90,12 +83,6 @@ impl<'a> Progress<'a> {
             Known::Fitted(cloud) => vec![cloud.clone()],
             Known::Sampled(estimate) => estimate.clouds()?.into_iter().flatten().collect(),
         };
-        let user = |mut cloud: Cloud| {
-            if *place.back != Similarity::IDENTITY {
-                cloud.transform(place.back.scale, place.back.rotation, place.back.translation);
-            }
-            to_user(&cloud, place.canonical_from_user)
-        };
-        Ok(Some(clouds.into_iter().map(user).collect()))
+        Ok(Some(clouds.iter().map(|cloud| to_user(cloud, place)).collect()))
     }
 }

@@ -8,13 +8,8 @@ use freerange_fit::{FitProgress, HoldConfig, RefineConfig, frame_of, quick_fit, 
 use freerange_flow::sample::{Estimate, SampleConfig, StartConfig, reconstruct};
 use freerange_model::Checkpoint;
 use freerange_splat::Cloud;
-use glam::DQuat;
 
-use crate::{
-    EncoderPlaces, Error, Options, Progress, Stage, load_checkpoint,
-    progress::{Known, Place},
-    require,
-};
+use crate::{EncoderPlaces, Error, Options, Progress, Stage, load_checkpoint, progress::Known, require};
 
 /// A model on a device, ready to reconstruct one object after the other.
 #[derive(Clone, Debug)]
@@ -148,7 +143,7 @@ impl Reconstructor {
             let (shown, all) = (chosen.len(), views.len());
             frame.notes.push(format!("the model is shown {shown} of {all} views: {}", names.join(", ")));
         }
-        let shown: Vec<View> = chosen.iter().map(|&i| canonical[i].clone()).collect();
+        let mut shown: Vec<View> = chosen.iter().map(|&i| canonical[i].clone()).collect();
         let uneven = shown.iter().filter(|v| v.image.width() != v.image.height()).count();
         if uneven > 0 {
             let all = shown.len();
@@ -160,22 +155,21 @@ impl Reconstructor {
 
         // Samples that nothing is made of have no use for others beside them.
         let members = if options.sample.refine > 0 { options.sample.ensemble } else { 1 };
-        let mut turned = Turned::members(members, shown);
         let begin = Instant::now();
         let mut fits = Vec::new();
         if let Some(StartConfig { fit: config, .. }) = &options.sample.start {
             for member in 0..members {
                 let done = [member * config.iterations, members * config.iterations];
                 let seed = member as u64;
-                let Turned { views, back } = &turned[member];
-                let place = Place { back, canonical_from_user: &frame.canonical_from_user };
-                let mut fit = watched(Stage::Fit, 0, place, &mut tell, done, |p| quick_fit(views, config, seed, p))?;
+                // The other members only help the first: nobody is shown them.
+                let place = (member == 0).then_some(&frame.canonical_from_user);
+                let mut fit = watched(Stage::Fit, 0, place, &mut tell, done, |p| quick_fit(&shown, config, seed, p))?;
                 // The fit knows better than the masks where the object is; it moves along, so that one is enough.
                 if member == 0 && !frame.kept {
-                    let correction = frame_of(&fit, &turned[0].views)?;
+                    let correction = frame_of(&fit, &shown)?;
                     fit.transform(correction.scale, correction.rotation, correction.translation);
                     canonical = moved(&canonical, &correction);
-                    turned = Turned::members(members, moved(&turned[0].views, &correction));
+                    shown = moved(&shown, &correction);
                     frame.canonical_from_user = correction.after(&frame.canonical_from_user);
                     let (shift, scale) = (correction.translation.length(), correction.scale);
                     frame.notes.push(format!("the quick fit moved it by {shift:.3} and scaled it by {scale:.3}"));
@@ -190,14 +184,14 @@ impl Reconstructor {
         let (steps, total) = (options.sample.steps, members * options.sample.steps);
         tell(&Progress::new(Stage::Sample, 0, total))?;
         let mut clouds = vec![Vec::with_capacity(members); options.seeds.len()]; // [seeds][members]
-        for (member, turned) in turned.iter().enumerate() {
-            let place = Place { back: &turned.back, canonical_from_user: &canonical_from_user };
+        for member in 0..members {
             let told = |estimate: &Estimate<'_>| {
                 let told = Progress::new(Stage::Sample, member * steps + estimate.index + 1, total);
-                tell(&Progress { estimate: Some((Known::Sampled(estimate), place)), ..told })
+                let known = (member == 0).then_some((Known::Sampled(estimate), &canonical_from_user));
+                tell(&Progress { estimate: known, ..told })
             };
-            let sampled = self.sample(&turned.views, fits.get(member), options, member as u64, told)?;
-            clouds.iter_mut().zip(sampled).for_each(|(members, cloud)| members.push(turned.back(cloud)));
+            let sampled = self.sample(&shown, fits.get(member), options, member as u64, told)?;
+            clouds.iter_mut().zip(sampled).for_each(|(members, cloud)| members.push(cloud));
         }
         seconds.push((Stage::Sample, begin.elapsed().as_secs_f64()));
 
@@ -216,8 +210,7 @@ impl Reconstructor {
                     let config = RefineConfig { steps, hold, seed, ..RefineConfig::default() };
                     let refined =
                         |p: &mut dyn FnMut(&FitProgress<'_>) -> _| refine(&plain, &members, &canonical, &config, p);
-                    let place = Place { back: &Similarity::IDENTITY, canonical_from_user: &canonical_from_user };
-                    Some(watched(Stage::Refine, i, place, &mut tell, [0, steps], refined)?)
+                    Some(watched(Stage::Refine, i, Some(&canonical_from_user), &mut tell, [0, steps], refined)?)
                 }
             };
             let (canonical, unrefined) = match refined {
@@ -267,34 +260,6 @@ impl Reconstructor {
     }
 }
 
-/// The views of an object in the canonical frame, turned about its upright axis: what is known of the object stays the same,
-/// what a fit and a network make of it differs.
-struct Turned {
-    views: Vec<View>,
-    back: Similarity,
-}
-
-impl Turned {
-    /// So many members of an ensemble, turned by multiples of the golden angle; the first is not turned.
-    fn members(count: usize, views: Vec<View>) -> Vec<Self> {
-        let golden = std::f64::consts::PI * (3.0 - 5f64.sqrt());
-        let turn = |member: usize| {
-            let rotation = DQuat::from_rotation_z(golden * member as f64);
-            let turn = Similarity { rotation, ..Similarity::IDENTITY };
-            Self { views: moved(&views, &turn), back: turn.inverse() }
-        };
-        let first = Self { views: views.clone(), back: Similarity::IDENTITY };
-        std::iter::once(first).chain((1..count).map(turn)).collect()
-    }
-
-    fn back(&self, mut cloud: Cloud) -> Cloud {
-        if self.back != Similarity::IDENTITY {
-            cloud.transform(self.back.scale, self.back.rotation, self.back.translation);
-        }
-        cloud
-    }
-}
-
 /// Restarts of k-means, as in the evaluation.
 const RESTARTS: usize = 10;
 
@@ -325,15 +290,18 @@ pub fn choose_views(views: &[View], most: usize) -> Result<Vec<usize>, Error> {
 fn watched(
     stage: Stage,
     sample: usize,
-    place: Place<'_>,
+    canonical_from_user: Option<&Similarity>,
     tell: &mut impl FnMut(&Progress<'_>) -> Result<(), Error>,
     [before, total]: [usize; 2],
     fit: impl FnOnce(&mut dyn FnMut(&FitProgress<'_>) -> ControlFlow<()>) -> Result<Cloud, freerange_fit::FitError>,
 ) -> Result<Cloud, Error> {
-    tell(&Progress { sample, ..Progress::new(stage, before, total) })?;
+    if before == 0 {
+        tell(&Progress { sample, ..Progress::new(stage, 0, total) })?;
+    }
     let mut stopped = Ok(());
     let cloud = fit(&mut |p| {
-        let (loss, estimate) = (Some(p.loss), Some((Known::Fitted(p.cloud), place)));
+        let estimate = canonical_from_user.map(|place| (Known::Fitted(p.cloud), place));
+        let loss = Some(p.loss);
         stopped = tell(&Progress { sample, loss, estimate, ..Progress::new(stage, before + p.step, total) });
         if stopped.is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
     });

@@ -33,7 +33,6 @@ fn parse_frames(text: &str) -> Result<(Frame, Frame), String> {
     Ok((from.parse()?, to.parse()?))
 }
 
-/// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
     Format::of(&args.output)?; // before anything is read
     let (from, to) = args.frame;

@@ -12,7 +12,6 @@ pub struct Args {
     json: bool,
 }
 
-/// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
     let devices = freerange::devices();
     if args.json {

@@ -35,7 +35,6 @@ fn parse_license(text: &str) -> Result<String, String> {
 /// What is known of the shipped checkpoint; links in it lead to files beside it.
 const SHIPPED_CARD: &str = include_str!("../../../../docs/model-card.md");
 
-/// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
     let path = runtime::local_or_shipped(args.checkpoint.as_deref())?;
     let bytes = checkpoint_bytes(path.as_deref())?;

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use freerange::{DeviceName, Reconstructor, choose_views, to_canonical};
+use freerange_camera::transforms_json;
 use freerange_scene::{
     inspect::{Inspection, inspect, sheet},
     write_masks,
@@ -33,6 +34,9 @@ pub struct Args {
     /// Views that the model would be shown [default: as `reconstruct`].
     #[arg(long, value_name = "K", value_parser = clap::value_parser!(u16).range(1..=256))]
     views: Option<u16>,
+    /// Also write the views as they are used, cut out and without their lens, with a transforms.json: into cut/, for other programs.
+    #[arg(long)]
+    cut: bool,
     /// Print what is understood as JSON.
     #[arg(long)]
     json: bool,
@@ -40,7 +44,7 @@ pub struct Args {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
-    let scene = args.photos.load(&args.scene, args.up)?;
+    let scene = args.photos.load(args.photos.cameras(&args.scene)?, args.up)?;
     let views = match args.views {
         Some(k) => usize::from(k),
         None => Reconstructor::shipped(&DeviceName::Cpu.open()?)?.views(),
@@ -53,6 +57,15 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     let json = serde_json::to_string_pretty(&found).map_err(CliError::failure)?;
     output.write("inspect.json", json.as_bytes())?;
     write_masks(&output.path("masks")?, &scene.cameras, &scene.loaded)?;
+    if args.cut {
+        let mut frames = Vec::new();
+        for view in &scene.loaded.views {
+            let name = format!("images/{}.png", view.name);
+            output.picture(&format!("cut/{name}"), &view.image)?;
+            frames.push((name, view.camera));
+        }
+        output.write("cut/transforms.json", transforms_json(&frames).as_bytes())?;
+    }
     output.commit()?;
     match args.json {
         true => println!("{json}"),

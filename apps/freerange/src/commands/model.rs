@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use freerange::{EncoderPlaces, checkpoint_header, load_checkpoint};
 use freerange_flow::config::TrainConfig;
-use freerange_model::{Compute, Execution, ModelConfig, ModelInfo, Workload};
+use freerange_model::{Compute, Execution, ModelConfig, ModelInfo, WeightsOrigin, Workload};
 
 use crate::{error::CliError, runtime};
 
@@ -57,7 +57,6 @@ pub struct Shrink {
     sampling: Option<PathBuf>,
 }
 
-/// Runs the command.
 pub fn run(command: &Command) -> Result<(), CliError> {
     match command {
         Command::Info(args) => info(args),
@@ -79,6 +78,16 @@ pub fn run(command: &Command) -> Result<(), CliError> {
     }
 }
 
+/// What `model info --json` prints.
+#[derive(serde::Serialize)]
+struct InfoJson<'a> {
+    #[serde(flatten)]
+    info: &'a ModelInfo,
+    /// The published weights that a checkpoint's frozen encoder had in training.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    encoder_weights: Option<&'a WeightsOrigin>,
+}
+
 fn info(args: &Info) -> Result<(), CliError> {
     let is_configuration =
         args.file.as_ref().is_some_and(|f| f.extension().is_some_and(|e| e == "toml") || TrainConfig::is_preset(f));
@@ -98,7 +107,9 @@ fn info(args: &Info) -> Result<(), CliError> {
     let execution = Execution { gpu: args.gpu, compute, recompute };
     let info = ModelInfo::with_execution(&model, workload, execution);
     if args.json {
-        println!("{}", serde_json::to_string_pretty(&info).map_err(CliError::input)?);
+        let encoder_weights = provenance.as_ref().and_then(|(_, origin)| origin.as_ref());
+        let json = serde_json::to_string_pretty(&InfoJson { info: &info, encoder_weights });
+        println!("{}", json.map_err(CliError::input)?);
         return Ok(());
     }
     println!("{info}");

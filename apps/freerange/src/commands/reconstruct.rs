@@ -1,6 +1,13 @@
 //! `freerange reconstruct`
 
-use std::{ops::ControlFlow, path::PathBuf, time::Instant};
+mod batch;
+mod holdout;
+
+use std::{
+    ops::ControlFlow,
+    path::{Path, PathBuf},
+    time::Instant,
+};
 
 use freerange::{
     Compute, Device, DeviceName, EncoderPlaces, Options, Reconstructor, SampleConfig, Scores, Solver, Stage, View,
@@ -15,26 +22,41 @@ use serde::Serialize;
 use crate::{
     error::CliError,
     output::OutputFolder,
-    photos::{Photos, UpChoice},
+    photos::{Photos, Scene, UpChoice},
     progress::Progress,
     runtime::local,
 };
+use holdout::Holdout;
 
 /// Reconstruct an object from posed images.
 ///
 /// Writes gaussians.ply (in the frame of your cameras; --format for others), turntable.gif, inputs/ (each input view
-/// beside its render) and report.json.
+/// beside its render) and report.json. Of several scenes each gets such a folder in the output, and scenes.json is their table; those that
+/// are finished are passed over, and one that cannot be made does not end the others.
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder of photos with cameras: transforms.json (or transforms_train.json and transforms_test.json), a COLMAP model, Polycam's
-    /// keyframes, a Metashape .xml or a RealityCapture .csv; or such a file.
-    scene: PathBuf,
+    /// keyframes, a Metashape .xml or a RealityCapture .csv; or such a file. Several: each gets a folder of its own in the output.
+    #[arg(required_unless_present = "list")]
+    scene: Vec<PathBuf>,
+    /// A file that names a scene on each line, relative to itself; lines that begin with # are passed over.
+    #[arg(long, value_name = "FILE")]
+    list: Option<PathBuf>,
+    /// Of many scenes make only share I of N (from 0), as in an array of jobs.
+    #[arg(long, value_name = "I/N", value_parser = share)]
+    share: Option<(usize, usize)>,
+    /// Of many scenes make those again that are finished.
+    #[arg(long)]
+    restart: bool,
     /// Where the results go.
     #[arg(short, long, default_value = "out")]
     output: PathBuf,
     /// Another scene of the same object whose views are only compared with.
     #[arg(long, value_name = "SCENE")]
     validate: Option<PathBuf>,
+    /// Photos to compare with instead of using them: so many, at even steps through the photos, or their names (NAME,NAME).
+    #[arg(long, value_name = "N|NAMES")]
+    holdout: Option<Holdout>,
     /// Views that the model is shown, from all around the object, if there are more [default: as many as it has seen at
     /// once in training, six for the shipped one]. Refinement looks at all.
     #[arg(long, value_name = "K", value_parser = clap::value_parser!(u16).range(1..=256))]
@@ -88,16 +110,17 @@ pub struct Sampling {
     #[arg(long, value_parser = clap::value_parser!(u32).range(4..=16))]
     pub depth: Option<u32>,
     /// Classifier-free guidance scale s; 1 is none [default: the checkpoint's].
-    #[arg(long)]
+    #[arg(long = "cfg-scale", alias = "guidance")]
     pub guidance: Option<f32>,
     /// Photometric guidance scale lambda; 0 is none [default: the checkpoint's].
-    #[arg(long)]
+    #[arg(long = "lambda-pg", alias = "photometric")]
     pub photometric: Option<f32>,
     /// How the steps are taken: euler, heun (two evaluations per step), multistep, or hold (only estimates are fed back)
     /// [default: the checkpoint's].
     #[arg(long, value_parser = parse_solver)]
     pub solver: Option<Solver>,
-    /// Arithmetic of the transformer: f32, or bf16 or f16 where the device has it [default: the checkpoint's].
+    /// Arithmetic of the transformer: f32, bf16 or f16 where the device has it, or auto, the faster of the first two [default:
+    /// the checkpoint's].
     #[arg(long, value_parser = parse_compute)]
     pub compute: Option<Compute>,
     /// Which way is up in the scene's frame: z, y, cameras (where the tops of the photos point), a direction X,Y,Z, or auto:
@@ -123,9 +146,17 @@ fn parse_solver(text: &str) -> Result<Solver, String> {
     serde_json::from_value(text.into()).map_err(|_| "expected euler, heun, multistep or hold".into())
 }
 
-/// `f32`, `bf16` or `f16`.
+fn share(text: &str) -> Result<(usize, usize), String> {
+    let parts = text.split_once('/').and_then(|(i, n)| Some((i.parse().ok()?, n.parse().ok()?)));
+    match parts {
+        Some((i, n)) if i < n => Ok((i, n)),
+        _ => Err("expected I/N with I from 0 to N - 1, as in 0/4".into()),
+    }
+}
+
+/// `f32`, `bf16`, `f16` or `auto`.
 pub fn parse_compute(text: &str) -> Result<Compute, String> {
-    serde_json::from_value(text.into()).map_err(|_| "expected f32, bf16 or f16".into())
+    serde_json::from_value(text.into()).map_err(|_| "expected f32, bf16, f16 or auto".into())
 }
 
 impl Sampling {
@@ -151,8 +182,8 @@ impl Sampling {
             Some(StartName::Fit) => Some(sample.start.take().unwrap_or_default()),
             None => sample.start.take(),
         };
-        sample.guidance = self.guidance.unwrap_or(sample.guidance);
-        sample.photometric = self.photometric.unwrap_or(sample.photometric);
+        sample.cfg_scale = self.guidance.unwrap_or(sample.cfg_scale);
+        sample.lambda_pg = self.photometric.unwrap_or(sample.lambda_pg);
         sample.solver = self.solver.unwrap_or(sample.solver);
         sample.compute = self.compute.unwrap_or(sample.compute);
         sample.refine = self.refine.unwrap_or(sample.refine);
@@ -203,6 +234,9 @@ struct Report {
     sampling: SampleConfig,
     /// Names of the views that the model was shown.
     views_shown: Vec<String>,
+    /// Names of the photos that were held out: the last of the further views.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    held_out: Vec<String>,
     gaussians: usize,
     /// Scale, rotation (x y z w) and translation from the scene's frame to the model's.
     canonical_from_user: freerange::Similarity,
@@ -230,19 +264,48 @@ struct Before {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
+    if batch::asked(args) {
+        return batch::run(args);
+    }
+    if args.restart {
+        return Err(CliError::input("--restart: expected several scenes, found one: it is always made anew"));
+    }
     let begin = Instant::now();
+    let path = &args.scene[0];
     let device = args.sampling.device.open()?;
-    let scene = args.photos.load(&args.scene, args.sampling.up)?;
-    let inputs = scene.loaded.views;
+    let scene = args.photos.load(args.photos.cameras(path)?, args.sampling.up)?;
+    let model = args.sampling.open(&device)?;
+    let (report, json) = reconstruct(args, path, scene, &model, &args.output, begin, || Ok(()))?;
+    match args.json {
+        true => println!("{json}"),
+        false => print(&report, &args.output),
+    }
+    Ok(())
+}
+
+/// Makes one scene and writes its results; the report, also as JSON. `begin`: when it was begun to be read; `commit`: is called before
+/// anything in the folder changes.
+fn reconstruct(
+    args: &Args,
+    path: &Path,
+    scene: Scene,
+    model: &Reconstructor,
+    folder: &Path,
+    begin: Instant,
+    commit: impl FnOnce() -> Result<(), CliError>,
+) -> Result<(Report, String), CliError> {
+    let mut inputs = scene.loaded.views;
     let mut further = scene.loaded.further;
     if let Some(path) = &args.validate {
         further.extend(Photos::further(path)?);
     }
-    let model = args.sampling.open(&device)?;
-    let mut options = args.sampling.options(&model, args.samples)?;
+    let held = args.holdout.as_ref().map(|h| h.take(&mut inputs)).transpose()?.unwrap_or_default();
+    let held_out = held.iter().map(|v| v.name.clone()).collect();
+    further.extend(held);
+    let mut options = args.sampling.options(model, args.samples)?;
     options.views = args.views.map(usize::from);
     options.frame = scene.frame;
-    let output = OutputFolder::create("reconstruct", &args.output)?;
+    let output = OutputFolder::create("reconstruct", folder)?;
     let mut seconds = vec![("load", begin.elapsed().as_secs_f64())];
 
     let mut watch = Watch::default();
@@ -290,10 +353,11 @@ pub fn run(args: &Args) -> Result<(), CliError> {
 
     notes.extend(result.notes);
     let report = Report {
-        scene: args.scene.clone(),
+        scene: path.into(),
         notes,
         sampling: options.sample,
         views_shown: result.shown.iter().map(|&i| inputs[i].name.clone()).collect(),
+        held_out,
         gaussians: result.samples.first().map_or(0, |s| s.gaussians.len()),
         canonical_from_user: result.canonical_from_user,
         samples,
@@ -302,12 +366,9 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     };
     let json = serde_json::to_string_pretty(&report).map_err(CliError::input)?;
     output.write("report.json", json.as_bytes())?;
+    commit()?;
     output.commit()?;
-    match args.json {
-        true => println!("{json}"),
-        false => print(&report, &args.output),
-    }
-    Ok(())
+    Ok((report, json))
 }
 
 /// Each input image beside its render.
@@ -324,7 +385,7 @@ fn comparisons(cloud: &freerange::Cloud, views: &[View]) -> Result<Vec<(String, 
         .collect()
 }
 
-fn print(report: &Report, output: &std::path::Path) {
+fn print(report: &Report, output: &Path) {
     for note in &report.notes {
         println!("note: {note}");
     }

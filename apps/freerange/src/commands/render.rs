@@ -24,7 +24,6 @@ pub struct Args {
     output: PathBuf,
 }
 
-/// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
     let Loaded { cloud, notes } = read(&args.file, args.frame)?;
     for note in notes {

@@ -8,10 +8,10 @@ use freerange_flow::{
     batch::step_rng,
     config::TrainConfig,
     log::Log,
-    trainer::{Initial, Report, Trainer, Validated},
+    trainer::{Initial, StepReport, Trainer, Validated},
 };
 
-use freerange_model::{Execution, FreeRange, ModelConfig, ModelInfo, Workload};
+use freerange_model::{Compute, Execution, FreeRange, ModelConfig, ModelInfo, Workload};
 
 use crate::{error::CliError, progress::Progress, runtime::local_or_shipped};
 
@@ -51,7 +51,6 @@ pub struct Args {
     device: DeviceName,
 }
 
-/// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
     let begin = Instant::now();
     let device = args.device.open()?;
@@ -61,6 +60,9 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         Some(output) if !args.dry_run => output,
         _ => return dry_run(&config, &device),
     };
+    if config.optimizer.compute == Compute::Auto {
+        eprintln!("computing in {}", config.optimizer.compute.on(&device));
+    }
     let total = config.total_steps();
     let encoders = EncoderPlaces::at(args.encoder_weights.clone());
     let encoder = encoders.for_training(&config.model.encoder)?;
@@ -140,8 +142,8 @@ fn dry_run(config: &TrainConfig, device: &Device) -> Result<(), CliError> {
 }
 
 /// What the progress says of a step.
-fn line(report: &Report) -> String {
-    let Report { loss, flow, held, seconds, .. } = report;
+fn line(report: &StepReport) -> String {
+    let StepReport { loss, flow, held, seconds, .. } = report;
     let mut line = format!("loss {loss:.3} flow {flow:.3} held {held:.4} {seconds:.2} s");
     for (count, what) in [(report.skipped, "steps not finite"), (report.broken, "objects unreadable")] {
         if count > 0 {

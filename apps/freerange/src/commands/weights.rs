@@ -17,7 +17,7 @@ pub enum Command {
 #[derive(clap::Args)]
 pub struct List {
     #[command(flatten)]
-    place: Place,
+    weights: WeightsArgs,
     /// Print JSON.
     #[arg(long)]
     json: bool,
@@ -30,7 +30,7 @@ pub struct Fetch {
     #[arg(required = true)]
     names: Vec<String>,
     #[command(flatten)]
-    place: Place,
+    weights: WeightsArgs,
     /// Address of the Hugging Face hub or of a mirror of it.
     #[arg(long, value_name = "URL", default_value = "https://huggingface.co")]
     hub: String,
@@ -38,13 +38,13 @@ pub struct Fetch {
 
 /// Where weights lie.
 #[derive(clap::Args)]
-struct Place {
+struct WeightsArgs {
     /// Folder of weights [default: freerange/weights in your cache folder].
     #[arg(long, value_name = "DIR")]
     weights: Option<PathBuf>,
 }
 
-impl Place {
+impl WeightsArgs {
     #[cfg(feature = "networks")]
     fn folder(&self) -> Result<PathBuf, CliError> {
         let known = self.weights.clone().or_else(freerange::machine::weights_folder);
@@ -52,7 +52,6 @@ impl Place {
     }
 }
 
-/// Runs the command.
 #[cfg(feature = "networks")]
 pub fn run(command: &Command) -> Result<(), CliError> {
     match command {
@@ -61,14 +60,13 @@ pub fn run(command: &Command) -> Result<(), CliError> {
     }
 }
 
-/// Runs the command.
 #[cfg(not(feature = "networks"))]
 pub fn run(command: &Command) -> Result<(), CliError> {
-    let (place, what) = match command {
-        Command::List(args) => (&args.place, format!("weights list{}", if args.json { " --json" } else { "" })),
-        Command::Fetch(args) => (&args.place, format!("weights fetch {} from {}", args.names.join(" "), args.hub)),
+    let (weights, what) = match command {
+        Command::List(args) => (&args.weights, format!("weights list{}", if args.json { " --json" } else { "" })),
+        Command::Fetch(args) => (&args.weights, format!("weights fetch {} from {}", args.names.join(" "), args.hub)),
     };
-    let folder = place.weights.as_ref().map_or(String::new(), |f| format!(" ({})", f.display()));
+    let folder = weights.weights.as_ref().map_or(String::new(), |f| format!(" ({})", f.display()));
     let build = "this program was built without networks; build it with `cargo build --release --features fetch`";
     Err(CliError::input(format!("{what}{folder}: {build}")))
 }
@@ -76,7 +74,7 @@ pub fn run(command: &Command) -> Result<(), CliError> {
 #[cfg(feature = "networks")]
 fn list(args: &List) -> Result<(), CliError> {
     use freerange_metrics::weights::{SETS, Weights};
-    let folder = args.place.folder()?;
+    let folder = args.weights.folder()?;
     let weights = Weights::new([folder.clone()]);
     let there: Vec<bool> = SETS.iter().map(|set| weights.find(set.name).is_ok()).collect();
     if args.json {
@@ -107,7 +105,7 @@ fn fetch(args: &Fetch) -> Result<(), CliError> {
         "this program was built without downloads (build it with `cargo build --release --features fetch`, --hub {}); by \
          hand, into {}:",
         args.hub,
-        args.place.folder()?.display()
+        args.weights.folder()?.display()
     )];
     for name in &args.names {
         for file in set(name)?.files {
@@ -125,7 +123,7 @@ fn fetch(args: &Fetch) -> Result<(), CliError> {
 #[cfg(feature = "fetch")]
 fn fetch(args: &Fetch) -> Result<(), CliError> {
     use freerange_metrics::weights::{FetchOptions, fetch, set};
-    let folder = args.place.folder()?;
+    let folder = args.weights.folder()?;
     for name in &args.names {
         set(name)?; // all names are looked at before the first download
     }

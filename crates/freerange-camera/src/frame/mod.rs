@@ -26,7 +26,7 @@ pub enum Up {
     Z,
     /// +y, as in glTF and OpenGL scenes.
     Y,
-    /// The mean of the cameras' own up directions.
+    /// Where the tops of the images point, as cameras are held level ([`cameras_up`]).
     Cameras,
     /// This one; not zero.
     Direction(DVec3),
@@ -140,19 +140,37 @@ fn optical_axis(view: &View) -> (DVec3, DVec3) {
     (view.camera.center(), DMat3::from_mat4(view.camera.world_to_camera).transpose().z_axis)
 }
 
+/// How much the mean of the images' tops counts against the cameras' sideways axes: people hold cameras level to some 0.1 radians.
+const LEVEL: f64 = 0.01;
+
+/// Which way is up, going by how cameras are held: the tops of the images point there on average, and their rows lie level. The rows tell
+/// more: the tops of images from one side all lean the same way. An image on its side has level columns instead. None where the tops
+/// cancel.
+pub fn cameras_up(views: &[View]) -> Option<DVec3> {
+    let axes: Vec<DMat3> = views.iter().map(|v| DMat3::from_mat4(v.camera.world_to_camera).transpose()).collect();
+    let mean = -axes.iter().map(|a| a.y_axis).sum::<DVec3>() / axes.len().max(1) as f64;
+    let top = mean.try_normalize().filter(|_| mean.length() >= 0.1)?;
+    let mut spread = DMat3::ZERO;
+    for a in &axes {
+        let level = if a.x_axis.dot(top).abs() <= a.y_axis.dot(top).abs() { a.x_axis } else { a.y_axis };
+        spread += DMat3::from_cols(level * level.x, level * level.y, level * level.z) * (1.0 / axes.len() as f64);
+    }
+    // The least sum of squared slopes of the rows, and of the distance to the mean.
+    let up = (spread + DMat3::from_diagonal(DVec3::splat(LEVEL))).inverse() * (LEVEL * top);
+    up.try_normalize().filter(|up| up.is_finite()).or(Some(top))
+}
+
 /// The rotation that turns the user's up to +z.
 fn upright(views: &[View], up: Up) -> Result<DQuat, CameraError> {
     let up = match up {
         Up::Z => return Ok(DQuat::IDENTITY),
         Up::Y => DVec3::Y,
-        Up::Cameras => {
-            let own = |view: &View| -DMat3::from_mat4(view.camera.world_to_camera).transpose().y_axis;
-            let mean = views.iter().map(own).sum::<DVec3>() / views.len() as f64;
-            if mean.length() < 0.1 {
+        Up::Cameras => match cameras_up(views) {
+            Some(up) => up,
+            None => {
                 return Err(CameraError::Frame("the cameras' up directions cancel; say which axis is up".into()));
             }
-            mean.normalize()
-        }
+        },
         Up::Direction(up) => match up.try_normalize() {
             Some(up) => up,
             None => return Err(CameraError::Frame(format!("up: expected a direction, found {up}"))),
@@ -213,4 +231,38 @@ fn from_silhouettes(silhouettes: &[Silhouette], start: DVec3) -> Result<(DVec3, 
     // The outlines bound the radius from below and come close to it; the hull bounds it from above, and guards
     // against specks that one mask has and the others do not.
     Ok((centre, seen(centre).min(hull.radius(centre))))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Camera;
+
+    fn view(azimuth: f64, elevation: f64, roll: f64) -> View {
+        let eye = DVec3::new(azimuth.cos() * elevation.cos(), azimuth.sin() * elevation.cos(), elevation.sin());
+        let side = DVec3::new(-azimuth.sin(), azimuth.cos(), 0.0);
+        let top = eye.cross(side);
+        let camera = Camera::look_at(eye, DVec3::ZERO, roll.cos() * top + roll.sin() * side, 1.0, 4, 4);
+        View { name: String::new(), camera, image: image::RgbaImage::new(4, 4) }
+    }
+
+    #[test]
+    fn level_cameras_tell_which_way_is_up_from_one_side_too() {
+        let off = |views: &[View]| cameras_up(views).unwrap().angle_between(DVec3::Z).to_degrees();
+        let rolls = [0.04, -0.06, 0.05, -0.02];
+        let one_side: Vec<View> = (0..4).map(|i| view(0.35 * f64::from(i), 0.6, rolls[i as usize])).collect();
+        let around: Vec<View> = (0..4).map(|i| view(1.6 * f64::from(i), 0.6, rolls[i as usize])).collect();
+        // The mean of their tops leans by their elevation.
+        assert!(off(&one_side) < 7.0, "{}", off(&one_side));
+        assert!(off(&around) < 4.0, "{}", off(&around));
+        // One held upright, its picture on its side.
+        let mut mixed = around.clone();
+        mixed.extend((0..4).map(|i| view(1.6 * f64::from(i) + 0.8, 0.5, 0.0)));
+        mixed[1] = view(1.6, 0.6, std::f64::consts::FRAC_PI_2);
+        assert!(off(&mixed) < 4.0, "{}", off(&mixed));
+        // All from one place, or one alone: their mean.
+        let still = vec![view(0.3, 0.5, 0.0); 3];
+        assert!((off(&still) - 0.5f64.to_degrees()).abs() < 1e-6, "{}", off(&still));
+        assert!(cameras_up(&[view(0.0, 0.4, 0.0), view(0.0, 0.4, std::f64::consts::PI)]).is_none());
+    }
 }

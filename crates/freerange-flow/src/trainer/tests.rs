@@ -1,6 +1,6 @@
 use std::io::{Seek, SeekFrom, Write};
 
-use freerange_data::{BuildOptions, Items, build};
+use freerange_build::{BuildOptions, Items, build};
 
 use super::*;
 use crate::sample::SampleConfig;
@@ -215,7 +215,7 @@ fn other_objects_are_measured_now_and_then_and_nothing_else_changes() {
     let place = tempfile::tempdir().unwrap();
     let mut measured = config();
     measured.validation = crate::ValidationConfig { every: 2, objects: 2 };
-    measured.sample = SampleConfig { steps: 2, guidance: 1.0, gradient_size: 16, ..SampleConfig::default() };
+    measured.sample = SampleConfig { steps: 2, cfg_scale: 1.0, gradient_size: 16, ..SampleConfig::default() };
     let run = |name: &str, config: &TrainConfig, until: u64| {
         let mut trainer = open(config, &place.path().join(name), None);
         let (mut losses, mut found) = (Vec::new(), Vec::new());

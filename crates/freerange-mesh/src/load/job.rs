@@ -6,6 +6,8 @@ use base64::Engine;
 use glam::{DVec3, Vec2, Vec3, Vec4};
 
 use super::{LoadLimits, read_at_most};
+use freerange_core::IoError;
+
 use crate::error::MeshError;
 use crate::texture::Material;
 
@@ -108,9 +110,8 @@ impl<'a> Job<'a> {
 
     /// Reads a file within the budget.
     pub fn read_file(&mut self, path: &Path) -> Result<Vec<u8>, MeshError> {
-        let bytes = read_at_most(path, self.bytes_left)
-            .map_err(|source| MeshError::Io { path: path.into(), source })?
-            .ok_or_else(|| self.too_big(path))?;
+        let bytes =
+            read_at_most(path, self.bytes_left).map_err(IoError::at(path))?.ok_or_else(|| self.too_big(path))?;
         self.charge_bytes(path, bytes.len() as u64)?;
         Ok(bytes)
     }

@@ -191,7 +191,7 @@ fn read_optional(job: &mut Job, name: &str) -> Result<Option<Vec<u8>>, MeshError
     let Ok(path) = job.resolve("file name", name) else { return Ok(None) };
     match job.read_file(&path) {
         Ok(bytes) => Ok(Some(bytes)),
-        Err(MeshError::Io { .. }) => Ok(None),
+        Err(MeshError::Io(_)) => Ok(None),
         Err(e) => Err(e),
     }
 }

@@ -315,7 +315,7 @@ fn files_outside_the_folder_are_not_read() {
         assert!(error.contains("buffers[0].uri"), "{uri}: {error}");
     }
     let error = load_mesh(&folder.join("none.glb"), &LoadLimits::default()).unwrap_err();
-    assert!(matches!(&error, MeshError::Io { path, .. } if path.ends_with("none.glb")), "{error}");
+    assert!(matches!(&error, MeshError::Io(e) if e.path.ends_with("none.glb")), "{error}");
     let error = load_mesh(&folder.join("mesh.stl"), &LoadLimits::default()).unwrap_err().to_string();
     assert_names(&error, &["mesh.stl", "extension", "found stl"]);
 }

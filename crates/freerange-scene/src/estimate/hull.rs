@@ -25,6 +25,93 @@ fn sums(mask: &[bool], w: usize, h: usize) -> Vec<u32> {
     sums
 }
 
+/// The views, ready to be asked whether a point is outside of their masks.
+struct Outside<'a> {
+    pictures: &'a [Picture],
+    /// For each: [`sums`], and whether the mask reaches the border.
+    masks: Vec<(Vec<u32>, bool)>,
+}
+
+impl<'a> Outside<'a> {
+    fn new(pictures: &'a [Picture], masks: &[Vec<bool>]) -> Self {
+        let masks = pictures
+            .iter()
+            .zip(masks)
+            .map(|(p, m)| (sums(m, p.width(), p.height()), reaches_border(m, p.width(), p.height())))
+            .collect();
+        Self { pictures, masks }
+    }
+
+    /// Tells `out` of each view that does not have the cube about a point in its mask, within half a pixel, until it answers no: then
+    /// None. Else how many views tell of the point at all.
+    fn each(&self, point: DVec3, half: f64, mut out: impl FnMut(usize) -> bool) -> Option<usize> {
+        let mut shown = 0;
+        for (i, (picture, (sums, cropped))) in self.pictures.iter().zip(&self.masks).enumerate() {
+            let (x, y, z) = picture.project(point);
+            let (w, h) = (picture.width() as f64, picture.height() as f64);
+            let beyond = z <= half || x < 0.0 || y < 0.0 || x >= w || y >= h;
+            if beyond && *cropped {
+                continue;
+            }
+            shown += 1;
+            let empty = beyond || {
+                let reach = picture.camera.fx * half / z + 0.5;
+                let range = |v: f64, size: f64| {
+                    ((v - reach).clamp(0.0, size) as usize, (v + reach).clamp(0.0, size).ceil() as usize)
+                };
+                let ((x0, x1), (y0, y1)) = (range(x, w), range(y, h));
+                let at = |x: usize, y: usize| sums[y * (w as usize + 1) + x];
+                at(x1, y1) + at(x0, y0) == at(x0, y1) + at(x1, y0)
+            };
+            if empty && !out(i) {
+                return None;
+            }
+        }
+        Some(shown)
+    }
+}
+
+/// Points of a sphere that at most two views do not have in their masks, and which two.
+pub struct Nearly {
+    points: Vec<(DVec3, [Option<usize>; 2])>,
+    step: f64,
+}
+
+impl Nearly {
+    /// Looks through the sphere. `grid`: points along its diameter.
+    pub fn carve(pictures: &[Picture], masks: &[Vec<bool>], centre: DVec3, radius: f64, grid: usize) -> Self {
+        let views = Outside::new(pictures, masks);
+        let step = 2.0 * radius / grid as f64;
+        let at = |i: usize| (i as f64 + 0.5) * step - radius;
+        let points = (0..grid)
+            .into_par_iter()
+            .flat_map_iter(|z| (0..grid * grid).map(move |i| (i % grid, i / grid, z)))
+            .map(|(x, y, z)| DVec3::new(at(x), at(y), at(z)))
+            .filter(|p| p.length() <= radius)
+            .filter_map(|p| {
+                let mut without = [None; 2];
+                let mut count = 0;
+                let shown = views.each(centre + p, 0.5 * step, |i| {
+                    if count < 2 {
+                        without[count] = Some(i);
+                    }
+                    count += 1;
+                    count <= 2
+                })?;
+                (shown >= count + 2).then_some((centre + p, without))
+            })
+            .collect();
+        Self { points, step }
+    }
+
+    /// The hull of all masks but these: what no other view excludes.
+    pub fn without(&self, left_out: &[usize]) -> Hull {
+        let own = |without: &[Option<usize>; 2]| without.iter().flatten().all(|i| left_out.contains(i));
+        let points = self.points.iter().filter(|(_, without)| own(without)).map(|(p, _)| *p).collect();
+        Hull { points, step: self.step }
+    }
+}
+
 /// The hull of some masks, sampled.
 pub struct Hull {
     /// Middles of its voxels.
@@ -49,45 +136,17 @@ impl Hull {
         missing: usize,
         grid: usize,
     ) -> Option<Self> {
-        let sums: Vec<(Vec<u32>, bool)> = pictures
-            .iter()
-            .zip(masks)
-            .map(|(p, m)| (sums(m, p.width(), p.height()), reaches_border(m, p.width(), p.height())))
-            .collect();
+        let views = Outside::new(pictures, masks);
         let within = |point: DVec3, half: f64| {
             if floor.is_some_and(|(normal, height)| (point - centre).dot(normal) < height - half) {
                 return false;
             }
-            let (mut out, mut shown) = (0, 0);
-            for (picture, (sums, cropped)) in pictures.iter().zip(&sums) {
-                let (x, y, z) = picture.project(point);
-                let (w, h) = (picture.width() as f64, picture.height() as f64);
-                let beyond = z <= half || x < 0.0 || y < 0.0 || x >= w || y >= h;
-                if beyond && *cropped {
-                    continue;
-                }
-                shown += 1;
-                if beyond {
-                    out += 1;
-                    if out > missing {
-                        return false;
-                    }
-                    continue;
-                }
-                let reach = picture.camera.fx * half / z + 0.5;
-                let range = |v: f64, size: f64| {
-                    ((v - reach).clamp(0.0, size) as usize, (v + reach).clamp(0.0, size).ceil() as usize)
-                };
-                let ((x0, x1), (y0, y1)) = (range(x, w), range(y, h));
-                let at = |x: usize, y: usize| sums[y * (w as usize + 1) + x];
-                if at(x1, y1) + at(x0, y0) == at(x0, y1) + at(x1, y0) {
-                    out += 1;
-                    if out > missing {
-                        return false;
-                    }
-                }
-            }
-            shown >= 2
+            let mut out = 0;
+            let shown = views.each(point, half, |_| {
+                out += 1;
+                out <= missing
+            });
+            shown.is_some_and(|shown| shown >= 2)
         };
         let (low, high) = (centre - DVec3::splat(radius), centre + DVec3::splat(radius));
         let coarse = Self::sample(low, high, COARSE, |p, half| p.distance(centre) <= radius && within(p, half))?;

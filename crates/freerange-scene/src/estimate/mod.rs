@@ -6,16 +6,18 @@
 //! (GrabCut, Rother et al. 2004); what no other view confirms is not the object (`hull`). These take turns until nothing changes. Work
 //! is done on small pictures, and only the outline is cut again on larger ones.
 
+mod evidence;
 mod hull;
 mod maxflow;
 mod mixture;
 mod picture;
 mod plane;
 
+pub use evidence::{Compared, Evidence};
 pub use hull::overlap;
 
 use crate::SceneError;
-use freerange_camera::View;
+use freerange_camera::{View, cameras_up};
 use glam::{DMat3, DVec3, Vec3};
 use hull::{Floor, Hull, reaches_border};
 use image::RgbaImage;
@@ -73,6 +75,8 @@ pub struct Estimate {
     pub clearness: Vec<f64>,
     /// The direction in which the plane that the object stands on faces, where one was found.
     pub up: Option<DVec3>,
+    /// What speaks for the poses.
+    pub evidence: Evidence,
     /// What was found, for the user to read.
     pub notes: Vec<String>,
 }
@@ -83,6 +87,22 @@ impl Estimate {
         let mean = |v: &[f64]| v.iter().sum::<f64>() / v.len().max(1) as f64;
         mean(&self.agreement).min(mean(&self.clearness))
     }
+
+    /// Why these masks should not be used, if views and poses do not belong together.
+    fn contradiction(&self, views: &[View]) -> Option<String> {
+        let mean = self.agreement.iter().sum::<f64>() / self.agreement.len() as f64;
+        let found = if mean < LEAST_AGREEMENT {
+            format!("masks and their common hull agree to {:.0} %", 100.0 * mean)
+        } else {
+            self.evidence.against()?
+        };
+        let worst = (0..views.len()).min_by(|a, b| self.agreement[*a].total_cmp(&self.agreement[*b])).unwrap_or(0);
+        Some(format!(
+            "the views contradict each other ({found}; {} agrees least): the poses may be wrong or belong to other photos, or the object \
+             moved, or it cannot be told from the background",
+            views[worst].name
+        ))
+    }
 }
 
 /// Mean agreement below which views are taken to contradict each other.
@@ -90,6 +110,16 @@ const LEAST_AGREEMENT: f64 = 0.7;
 
 /// Finds the object's masks. The views' own alpha only says what they show (corners of undistorted photos are empty).
 pub fn masks(views: &[View], hints: &Hints) -> Result<Estimate, SceneError> {
+    let found = unjudged(views, hints)?;
+    match found.contradiction(views) {
+        Some(reason) => Err(SceneError::NotCutOut { reason }),
+        None => Ok(found),
+    }
+}
+
+/// [`masks`] also where the views contradict each other. For tests.
+#[doc(hidden)]
+pub fn unjudged(views: &[View], hints: &Hints) -> Result<Estimate, SceneError> {
     let refuse = |reason: String| Err(SceneError::NotCutOut { reason });
     if views.len() < 3 {
         return refuse(format!("expected at least 3 views, found {}", views.len()));
@@ -116,23 +146,14 @@ pub fn masks(views: &[View], hints: &Hints) -> Result<Estimate, SceneError> {
             return refuse(format!("nothing in {} differs from what is around the object", view.name));
         }
     }
-    let mean = agreement.iter().sum::<f64>() / agreement.len() as f64;
-    if mean < LEAST_AGREEMENT {
-        let worst = (0..views.len()).min_by(|a, b| agreement[*a].total_cmp(&agreement[*b])).unwrap_or(0);
-        return refuse(format!(
-            "the views contradict each other (masks and their common hull agree to {:.0} %, least in {}): the poses may be wrong, or \
-             the object moved, or it cannot be told from the background",
-            100.0 * mean,
-            views[worst].name
-        ));
-    }
+    let evidence = stage.evidence(&small);
     let alpha = views
         .iter()
         .zip(large.pictures.iter().zip(&large.masks))
         .map(|(view, (picture, mask))| soft(mask, picture, view.image.dimensions()))
         .collect();
     let up = stage.plane.as_ref().map(|p| p.normal);
-    Ok(Estimate { alpha, agreement, clearness: small.clearness, up, notes })
+    Ok(Estimate { alpha, agreement, clearness: small.clearness, up, evidence, notes })
 }
 
 /// The scene as far as it does not change while masks are looked for.
@@ -144,6 +165,8 @@ struct Stage {
     /// Mean distance of the cameras.
     distance: f64,
     plane: Option<Plane>,
+    /// The plane on which the views agree best, whether it stands out or not.
+    best: Option<Plane>,
 }
 
 /// Masks in the making.
@@ -181,10 +204,9 @@ fn meeting_point(views: &[View]) -> Option<DVec3> {
     (point.is_finite() && views.iter().all(ahead)).then_some(point)
 }
 
-/// Where the tops of the photos point, on average.
+/// Which way is up, as far as the cameras tell.
 fn mean_up(views: &[View]) -> DVec3 {
-    let own = |v: &View| -DMat3::from_mat4(v.camera.world_to_camera).transpose().y_axis;
-    views.iter().map(own).sum::<DVec3>().try_normalize().unwrap_or(DVec3::Z)
+    cameras_up(views).unwrap_or(DVec3::Z)
 }
 
 /// How far the ray through a pixel passes by `centre`.
@@ -220,11 +242,21 @@ impl Stage {
                 "the point that the cameras look at is not in the photos; say where the object is (--center X,Y,Z)";
             return Err(SceneError::NotCutOut { reason: reason.into() });
         }
-        let mut stage = Self { pictures, centre, radius, distance, plane: None };
+        let mut stage = Self { pictures, centre, radius, distance, plane: None, best: None };
         let object: Vec<Vec<bool>> =
             (0..views.len()).map(|i| stage.nearness(i).iter().map(|d| *d < 0.6).collect()).collect();
-        stage.plane = plane::find(&stage.pictures, &object, centre, mean_up(views), distance);
+        let found = plane::find(&stage.pictures, &object, centre, mean_up(views), distance);
+        stage.plane = found.filter(|(_, stands_out)| *stands_out).map(|(plane, _)| plane);
+        stage.best = found.map(|(plane, _)| plane);
         Ok(stage)
+    }
+
+    fn evidence(&self, found: &Masks) -> Evidence {
+        let reach = 1.3 * self.radius;
+        let missing = usize::from(self.pictures.len() >= 6);
+        let hull = Hull::carve(&self.pictures, &found.masks, self.centre, reach, self.floor(), missing, 2 * ROUGH);
+        let (masks, plane) = (&found.masks, self.best.as_ref());
+        evidence::gather(&self.pictures, masks, hull.as_ref(), self.centre, reach, plane, self.distance)
     }
 
     fn floor(&self) -> Floor {
@@ -578,6 +610,14 @@ pub fn agreement(views: &[View], centre: DVec3, radius: f64) -> Vec<f64> {
     }
 }
 
+/// How far each mask (the views' alpha) and those of the others contradict each other, 0 to 1: the share of it that lies outside of the
+/// others' hull, or the share of the others that it alone keeps out of the hull, on average; the larger of both. For three views or more.
+pub fn contradictions(views: &[View], centre: DVec3, radius: f64) -> Vec<f64> {
+    let pictures: Vec<Picture> = views.par_iter().map(|v| Picture::of(v, SMALL)).collect();
+    let masks: Vec<Vec<bool>> = pictures.iter().map(|p| p.valid.clone()).collect();
+    evidence::contradictions(&pictures, &masks, centre, radius)
+}
+
 /// The direction in which the plane faces that the object stands on, where one stands out. `views`: the object cut out; `whole`: the
 /// photos with what is around it, in the same order.
 pub fn table_faces(views: &[View], whole: &[RgbaImage]) -> Option<DVec3> {
@@ -595,5 +635,6 @@ pub fn table_faces(views: &[View], whole: &[RgbaImage]) -> Option<DVec3> {
         .zip(whole)
         .map(|(v, image)| Picture::of(&View { name: String::new(), camera: v.camera, image: image.clone() }, SMALL))
         .collect();
-    Some(plane::find(&pictures, &object, centre, mean_up(views), distance)?.normal)
+    let (plane, stands_out) = plane::find(&pictures, &object, centre, mean_up(views), distance)?;
+    stands_out.then_some(plane.normal)
 }

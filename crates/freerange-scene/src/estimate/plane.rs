@@ -30,9 +30,15 @@ pub fn across(n: DVec3) -> (DVec3, DVec3) {
     (a, n.cross(a))
 }
 
-/// The plane on which the views agree best outside of `object` (`[h, w]` for each picture); none where no plane stands out, as on a table
-/// of one plain colour.
-pub fn find(pictures: &[Picture], object: &[Vec<bool>], centre: DVec3, up: DVec3, distance: f64) -> Option<Plane> {
+/// The plane on which the views agree best outside of `object` (`[h, w]` for each picture), and whether it stands out: it does not on a
+/// table of one plain colour.
+pub fn find(
+    pictures: &[Picture],
+    object: &[Vec<bool>],
+    centre: DVec3,
+    up: DVec3,
+    distance: f64,
+) -> Option<(Plane, bool)> {
     let (a, b) = across(up);
     let normal = |tilt: [f64; 2]| (up + tilt[0] * a + tilt[1] * b).normalize();
     let score = |p: [f64; 3], grid: usize| {
@@ -60,8 +66,8 @@ pub fn find(pictures: &[Picture], object: &[Vec<bool>], centre: DVec3, up: DVec3
         .map(|start| descend(*start, |p| score(p, 48).unwrap_or(f64::INFINITY)))
         .min_by(|x, y| x.0.total_cmp(&y.0))?;
     // On the scenes that this was made with: 5 on the table, 17 to 20 elsewhere.
-    let stands_out = best < 0.6 * middle;
-    stands_out.then(|| Plane { normal: normal([p[0], p[1]]), height: p[2] * distance, disagreement: best })
+    let plane = Plane { normal: normal([p[0], p[1]]), height: p[2] * distance, disagreement: best };
+    Some((plane, best < 0.6 * middle))
 }
 
 /// Nelder and Mead's simplex in three dimensions, 80 steps: `(value, point)`.

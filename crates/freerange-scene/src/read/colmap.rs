@@ -310,8 +310,9 @@ pub(super) fn look_for(scene: &Path) -> Result<Option<PathBuf>, SceneError> {
     Ok(numbered.into_iter().chain([sparse, scene.to_path_buf()]).find(|folder| files(folder).is_some()))
 }
 
-/// Reads the model in `folder`. Images are looked for in `images` beside it or up to two folders above, else right there.
-pub(super) fn read(folder: &Path) -> Result<Cameras, SceneError> {
+/// Reads the model in `folder`. Images are looked for in `images_in`, or in `images` beside the model or up to two folders above, else right
+/// there.
+pub(super) fn read(folder: &Path, images_in: Option<&Path>) -> Result<Cameras, SceneError> {
     let [cameras_file, images_file] = files(folder).ok_or_else(|| {
         In(folder).malformed("", "expected cameras.bin and images.bin, or cameras.txt and images.txt, in this folder")
     })?;
@@ -326,6 +327,9 @@ pub(super) fn read(folder: &Path) -> Result<Cameras, SceneError> {
     let above: Vec<&Path> = absolute.ancestors().take(3).collect();
     let mut folders: Vec<PathBuf> = above.iter().map(|f| f.join("images")).filter(|f| f.is_dir()).collect();
     folders.extend(above.iter().map(|f| f.to_path_buf()));
+    if let Some(images) = images_in {
+        folders = vec![images.to_path_buf()];
+    }
     let mut names = HashSet::new();
     let photos = images
         .into_iter()

@@ -137,10 +137,13 @@ pub fn parse(file: &Path, bytes: &[u8]) -> Result<(Vec<Labelled>, usize), SceneE
     Ok((photos, without))
 }
 
-pub(super) fn read(file: &Path) -> Result<Cameras, SceneError> {
+pub(super) fn read(file: &Path, images: Option<&Path>) -> Result<Cameras, SceneError> {
     let (labelled, without) = parse(file, &bytes_of(file)?)?;
     let folder = file.parent().unwrap_or(Path::new(""));
-    let folders: Vec<PathBuf> = vec![folder.join("images"), folder.to_path_buf()];
+    let folders: Vec<PathBuf> = match images {
+        Some(images) => vec![images.to_path_buf()],
+        None => vec![folder.join("images"), folder.to_path_buf()],
+    };
     let photos = labelled
         .into_iter()
         .map(|l| {

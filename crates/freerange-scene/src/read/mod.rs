@@ -14,6 +14,7 @@ use crate::{SceneError, error::In};
 use freerange_camera::{Camera, Lens, scene::nearest_rotation};
 use glam::{DMat3, DMat4, DVec3};
 use std::{
+    collections::BTreeSet,
     io::Read,
     path::{Path, PathBuf},
 };
@@ -136,16 +137,34 @@ pub struct Cameras {
     pub notes: Vec<String>,
 }
 
-/// Reads the cameras of a scene: a folder, or a file of one of the formats.
-///
-/// `format` decides where a folder could be two things; without it that is an error that names both. `turntable` takes a folder
-/// of photos without any cameras.
+/// How cameras are read.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ReadConfig {
+    /// Decides where a folder could be two things; without it that is an error that names both.
+    pub format: Option<Format>,
+    /// The folder holds photos without any cameras, taken like this.
+    pub turntable: Option<Turntable>,
+    /// The folder of the photos, where they do not lie where the format has them.
+    pub images: Option<PathBuf>,
+}
+
+/// [`cameras_with`] with all photos in their usual places.
 pub fn cameras(path: &Path, format: Option<Format>, turntable: Option<&Turntable>) -> Result<Cameras, SceneError> {
+    cameras_with(path, &ReadConfig { format, turntable: turntable.copied(), images: None })
+}
+
+/// Reads the cameras of a scene: a folder, or a file of one of the formats.
+pub fn cameras_with(path: &Path, config: &ReadConfig) -> Result<Cameras, SceneError> {
     let metadata = std::fs::metadata(path).map_err(|e| In(path).read(e))?;
-    if let Some(turntable) = turntable {
-        return turntable::read(path, turntable);
+    let (format, images) = (config.format, config.images.as_deref());
+    if let Some(folder) = images {
+        entries(folder)?;
     }
-    let cameras = if metadata.is_dir() {
+    if let Some(turntable) = &config.turntable {
+        let folder = images.unwrap_or(path);
+        return turntable::read(folder, turntable);
+    }
+    let mut cameras = if metadata.is_dir() {
         let mut found: Vec<(Format, PathBuf)> = Vec::new();
         for candidate in Format::ALL {
             if format.is_none_or(|f| f == candidate) {
@@ -154,7 +173,7 @@ pub fn cameras(path: &Path, format: Option<Format>, turntable: Option<&Turntable
         }
         match found.as_slice() {
             [] => return Err(nothing(path, format)?),
-            [(format, file)] => read(*format, file)?,
+            [(format, file)] => read(*format, file, images)?,
             [(a, first), (b, second), ..] => {
                 return Err(SceneError::Ambiguous {
                     folder: path.into(),
@@ -181,24 +200,47 @@ pub fn cameras(path: &Path, format: Option<Format>, turntable: Option<&Turntable
             return Err(SceneError::Option { option: "--cameras", expected, found: format.name().into() });
         }
         match own {
-            Format::Colmap => colmap::read(path.parent().unwrap_or(Path::new("")))?,
-            own => read(own, path)?,
+            Format::Colmap => colmap::read(path.parent().unwrap_or(Path::new("")), images)?,
+            own => read(own, path, images)?,
         }
     };
     if cameras.photos.len() > LARGEST_SCENE {
         let found = cameras.photos.len();
         return Err(In(path).field("", "photos", &format!("at most {LARGEST_SCENE}"), found));
     }
+    if matches!(cameras.format, Format::Colmap | Format::Metashape | Format::Realitycapture) {
+        cameras.notes.extend(without_camera(&cameras.photos));
+    }
     Ok(cameras)
 }
 
-fn read(format: Format, file: &Path) -> Result<Cameras, SceneError> {
+/// A note on the images that lie beside the photos and have no camera: programs do not manage to place them all.
+fn without_camera(photos: &[Photo]) -> Option<String> {
+    let folders: BTreeSet<&Path> = photos.iter().filter_map(|p| p.image.parent()).collect();
+    let known: BTreeSet<&Path> = photos.iter().map(|p| p.image.as_path()).collect();
+    let there = folders.into_iter().filter_map(|f| entries(f).ok()).flatten();
+    let left: Vec<String> = there
+        .filter(|p| has_extension(p, &IMAGES) && !known.contains(p.as_path()))
+        .filter_map(|p| p.file_name().map(|n| n.to_string_lossy().into_owned()))
+        .collect();
+    let more = if left.len() > 6 { ", ..." } else { "" };
+    let names = left.iter().take(6).cloned().collect::<Vec<_>>().join(", ");
+    (!left.is_empty()).then(|| format!("{} photos have no camera and are left out: {names}{more}", left.len()))
+}
+
+fn read(format: Format, file: &Path, images: Option<&Path>) -> Result<Cameras, SceneError> {
     match format {
+        Format::Transforms if images.is_some() => Err(SceneError::Option {
+            option: "--images",
+            expected: "cameras that do not say where their photos are (colmap, polycam, metashape, realitycapture)"
+                .into(),
+            found: "transforms.json, which does".into(),
+        }),
         Format::Transforms => transforms::read(file),
-        Format::Colmap => colmap::read(file),
-        Format::Polycam => polycam::read(file),
-        Format::Metashape => metashape::read(file),
-        Format::Realitycapture => realitycapture::read(file),
+        Format::Colmap => colmap::read(file, images),
+        Format::Polycam => polycam::read(file, images),
+        Format::Metashape => metashape::read(file, images),
+        Format::Realitycapture => realitycapture::read(file, images),
         Format::Turntable => Err(SceneError::Option {
             option: "--cameras",
             expected: "the format of a file; turntables have --turntable ELEVATION,FOV".into(),

@@ -50,12 +50,13 @@ fn finite(file: &Path, root: &Map<String, Value>, name: &str) -> Result<f64, Sce
     }
 }
 
-pub(super) fn read(folder: &Path) -> Result<Cameras, SceneError> {
+pub(super) fn read(folder: &Path, images_in: Option<&Path>) -> Result<Cameras, SceneError> {
     let corrected = folder.join("corrected_cameras").is_dir();
     let (cameras, images) = match corrected {
         true => (folder.join("corrected_cameras"), folder.join("corrected_images")),
         false => (folder.join("cameras"), folder.join("images")),
     };
+    let images = images_in.map_or(images, Path::to_path_buf);
     let mut photos = Vec::new();
     for file in entries(&cameras)?.into_iter().filter(|f| has_extension(f, &["json"])) {
         let camera = camera(&file, &bytes_of(&file)?)?;

@@ -86,9 +86,12 @@ pub fn parse(file: &Path, bytes: &[u8]) -> Result<Vec<(String, Intrinsics, Lens)
     Ok(rows)
 }
 
-pub(super) fn read(file: &Path) -> Result<Cameras, SceneError> {
+pub(super) fn read(file: &Path, images: Option<&Path>) -> Result<Cameras, SceneError> {
     let folder = file.parent().unwrap_or(Path::new(""));
-    let folders: Vec<PathBuf> = vec![folder.join("images"), folder.to_path_buf()];
+    let folders: Vec<PathBuf> = match images {
+        Some(images) => vec![images.to_path_buf()],
+        None => vec![folder.join("images"), folder.to_path_buf()],
+    };
     let photos = parse(file, &bytes_of(file)?)?
         .into_iter()
         .map(|(name, intrinsics, lens)| {

@@ -79,7 +79,7 @@ impl std::fmt::Display for Part {
 }
 
 #[derive(Serialize)]
-struct Report {
+struct BenchReport {
     device: String,
     hardware: String,
     commit: String,
@@ -94,16 +94,12 @@ struct Report {
     train: Vec<whole::Train>,
 }
 
-/// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
     let device = args.device.open()?;
     let listed = devices().into_iter().find(|d| d.is(&device));
     let (name, hardware, gpu) = listed
         .map_or_else(|| (args.device.to_string(), "unknown".into(), false), |d| (d.name, d.properties.hardware, d.gpu));
-    let compute = args.compute.unwrap_or(match gpu && Compute::Bf16.supported(&device) {
-        true => Compute::Bf16,
-        false => Compute::F32,
-    });
+    let compute = args.compute.unwrap_or(Compute::Auto).on(&device);
     require(compute, &device)?;
     let sizes = match args.sizes.is_empty() {
         false => args.sizes.clone(),
@@ -111,7 +107,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         true => vec!["tiny".into()],
     };
     let timer = timer::Timer { device: device.clone(), seconds: args.seconds };
-    let mut report = Report {
+    let mut report = BenchReport {
         device: name,
         hardware,
         commit: runtime::commit(),

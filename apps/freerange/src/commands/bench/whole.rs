@@ -3,8 +3,8 @@
 use std::{ops::ControlFlow, path::Path, time::Instant};
 
 use burn::tensor::{Distribution, Tensor};
+use freerange_build::{GaussianSource, generate_object};
 use freerange_camera::View;
-use freerange_data::{GaussianSource, Object};
 use freerange_fit::quick_fit;
 use freerange_flow::{
     batch::{Conditioning, shrink},
@@ -100,7 +100,7 @@ pub fn sample(
     let config = load(size)?;
     let (stage, device) = (config.stage(u64::MAX).clone(), &timer.device);
     let model_config = ModelConfig { image_size: stage.image_size, ..config.model.clone() };
-    let object = Object::generate(7, &config.data.object, &[stage.depth])?;
+    let object = generate_object(7, &config.data.object, &[stage.depth])?;
     let mut statistics = Statistics::default();
     statistics.add(object.slice(stage.depth)?)?;
     let rng = &mut rand_chacha::ChaCha8Rng::seed_from_u64(1);
@@ -123,7 +123,7 @@ pub fn sample(
     let conditioning = Conditioning::new(&seen, &model_config, device)?;
     let encode_seconds = timer.time(|| Ok(conditioning.clone().encode(&model)))?;
     let tokens = conditioning.encode(&model);
-    let branches = if settings.guidance == 1.0 { 1 } else { 2 };
+    let branches = if settings.cfg_scale == 1.0 { 1 } else { 2 };
     let tokens = tokens.repeat_dim(0, branches);
     let normal = |b: usize| Tensor::<3>::random([b, n, 14], Distribution::Normal(0.0, 1.0), device);
     let (z, hint) = (normal(branches * b), normal(branches * b));
@@ -141,7 +141,7 @@ pub fn sample(
     if model_config.gradient_channels {
         gradient_seconds += gradient_at(settings.gradient_size)?;
     }
-    if settings.photometric > 0.0 {
+    if settings.lambda_pg > 0.0 {
         let size = settings.photometric_size.unwrap_or(settings.gradient_size);
         gradient_seconds += settings.photometric_repeats as f64 * gradient_at(size)?;
     }

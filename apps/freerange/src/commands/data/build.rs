@@ -3,9 +3,8 @@
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
-use freerange_data::{
-    BuildConfig, BuildOptions, GaussianSource, HeldOutPsnr, Items, Seconds, Share, Store, Summary, build,
-};
+use freerange_build::{BuildConfig, BuildOptions, GaussianSource, Items, Seconds, Share, Summary, build};
+use freerange_data::{HeldOutPsnr, Store};
 use freerange_eval::memory::peak_memory;
 use freerange_flow::config::TrainConfig;
 

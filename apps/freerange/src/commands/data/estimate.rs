@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::sync::Mutex;
 
-use freerange_data::{GaussianSource, Items, estimate};
+use freerange_build::{GaussianSource, Items, estimate};
 
 use super::build::{InputArgs, Settings, psnr_line, seconds_line};
 use crate::{error::CliError, progress::Progress};
@@ -26,7 +26,6 @@ pub struct Args {
     json: bool,
 }
 
-/// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
     let items = match args.input.is_generated() {
         true => Items::generated(args.objects.unwrap_or(args.sample).max(args.sample), 0),

@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
+use freerange_build::{GalleryConfig, gallery};
 use freerange_flow::config::TrainConfig;
-use freerange_mesh::{GalleryConfig, gallery};
 
 use crate::error::CliError;
 
@@ -30,7 +30,6 @@ pub struct Args {
     first_seed: u64,
 }
 
-/// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
     let object = TrainConfig::load(&args.config)?.data.object;
     let config = GalleryConfig {

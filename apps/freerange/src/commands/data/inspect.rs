@@ -2,7 +2,8 @@
 
 use std::path::PathBuf;
 
-use freerange_data::{ObjectSource, Shards, Store, contact_sheet, inspect};
+use freerange_build::contact_sheet;
+use freerange_data::{ObjectSource, Shards, Store, inspect};
 
 use crate::error::CliError;
 
@@ -26,7 +27,6 @@ pub struct Args {
     json: bool,
 }
 
-/// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
     let store = Store::open(&args.location)?;
     let report = inspect(&store, args.verify)?;

@@ -1,6 +1,7 @@
 //! `freerange data merge`
 
-use freerange_data::{Store, collect, merge};
+use freerange_build::{collect, merge};
+use freerange_data::Store;
 
 use crate::error::CliError;
 
@@ -13,7 +14,6 @@ pub struct Args {
     others: Vec<String>,
 }
 
-/// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
     let store = Store::open(&args.output)?;
     for other in &args.others {

@@ -40,7 +40,6 @@ pub enum Command {
     Gallery(gallery::Args),
 }
 
-/// Runs the command.
 pub fn run(command: &Command) -> Result<(), CliError> {
     match command {
         Command::Build(args) => build::run(args),

@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
+use freerange_build::render_views;
 use freerange_camera::{View, transforms_json};
-use freerange_data::render_views;
 
 use super::build::{InputArgs, Settings};
 use crate::{error::CliError, output::OutputFolder, progress::Progress};
@@ -20,7 +20,6 @@ pub struct Args {
     output: PathBuf,
 }
 
-/// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
     let items = args.input.items()?;
     let config = args.settings.build_config(None)?;

@@ -60,43 +60,16 @@ fn set(text: &str) -> Result<Set, String> {
 /// The folder of the default settings.
 const DEFAULT: &str = "default";
 
-/// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
     let a = &args.run;
-    if a.method != MethodName::Model {
-        return Err(CliError::input("ablations are of the model: expected --method model"));
-    }
-    let inputs = match a.inputs()[..] {
-        [n] => n,
-        _ => return Err(CliError::input("expected one number in --inputs; --input-counts holds those to compare")),
-    };
-    if let Some(n) = args.input_counts.iter().find(|n| !(2..=64).contains(*n)) {
-        return Err(CliError::input(format!("--input-counts: expected 2 to 64, found {n}")));
-    }
+    let inputs = args.checked_inputs()?;
     let device = a.sampling.device.open()?;
     let method = a.open_method(&device)?;
     let Method::Model { model, options: default, sha256 } = &method else {
         return Err(CliError::failure("a model's method expected"));
     };
-    let values = Values {
-        steps: args.step_counts.clone(),
-        lambda: args
-            .lambdas
-            .clone()
-            .unwrap_or_else(|| [0.25, 0.5, 2.0, 4.0].map(|factor| factor * default.sample.photometric).into()),
-        scale: args.scales.clone(),
-        inputs: args.input_counts.clone(),
-        solvers: args.solvers.clone(),
-    };
-    let variants = variants(&args.sets, &values);
     // All settings are looked at before the first one is worked on.
-    let mut planned: Vec<(Variant, Option<(Options, usize)>)> = Vec::new();
-    for variant in variants {
-        let options = apply(&variant, default)?;
-        let count = variant.inputs.unwrap_or(inputs);
-        let same = options.sample == default.sample && count == inputs;
-        planned.push((variant, (!same).then_some((options, count))));
-    }
+    let planned = args.plan(default, inputs)?;
     let (shared, source) = a.open_shared(&device)?;
     let open = |folder: &str, options: &Options, count: usize| {
         let method = Method::Model { model: model.clone(), options: Box::new(options.clone()), sha256: sha256.clone() };
@@ -108,9 +81,9 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         Ok::<_, CliError>(Run { method, folder, settings, views: a.views.sets(), inputs: vec![count], prefix })
     };
     let mut runs = vec![open(DEFAULT, default, inputs)?];
-    let mut place = Vec::new(); // index of each variant's run
+    let mut run_of = Vec::new(); // index of each variant's run
     for (variant, different) in &planned {
-        place.push(match different {
+        run_of.push(match different {
             None => 0,
             Some((options, count)) => {
                 runs.push(open(&variant.folder, options, *count)?);
@@ -128,26 +101,73 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     if reports[0].measured().next().is_none() {
         return verdict(&reports[..1]);
     }
-    let variants = planned.into_iter().zip(place);
+    let variants = planned.into_iter().zip(run_of);
     let variants = variants.map(|((variant, _), i)| {
         let folder = if i == 0 { DEFAULT.to_owned() } else { variant.folder.clone() };
         (variant, folder, reports[i].clone())
     });
     let study = Study::new(&reports[0], variants.collect(), 0)?;
-    let markdown = document(&study, &environment);
-    let write = |name: &str, text: &str| {
-        let path = args.output.join(name);
-        freerange_splat::write_atomically(&path, |f| std::io::Write::write_all(f, text.as_bytes()))
-            .map_err(|e| CliError::file(&path, e))
-    };
-    let json = serde_json::to_string_pretty(&study).map_err(CliError::input)?;
-    write("ablations.md", &markdown)?;
-    write("ablations.json", &json)?;
-    match args.json {
-        true => println!("{json}"),
-        false => println!("{markdown}\n{}", args.output.join("ablations.md").display()),
-    }
+    args.write(&study, &environment)?;
     verdict(&reports)
+}
+
+/// Options and number of inputs of a variant; none where they are the default's.
+type Different = Option<(Options, usize)>;
+
+impl Args {
+    /// The number of input views, where the arguments go together.
+    fn checked_inputs(&self) -> Result<usize, CliError> {
+        if self.run.method != MethodName::Model {
+            return Err(CliError::input("ablations are of the model: expected --method model"));
+        }
+        let inputs = match self.run.inputs()[..] {
+            [n] => n,
+            _ => {
+                return Err(CliError::input("expected one number in --inputs; --input-counts holds those to compare"));
+            }
+        };
+        match self.input_counts.iter().find(|n| !(2..=64).contains(*n)) {
+            Some(n) => Err(CliError::input(format!("--input-counts: expected 2 to 64, found {n}"))),
+            None => Ok(inputs),
+        }
+    }
+
+    /// The variants, and in what they differ from the default.
+    fn plan(&self, default: &Options, inputs: usize) -> Result<Vec<(Variant, Different)>, CliError> {
+        let multiples = || [0.25, 0.5, 2.0, 4.0].map(|factor| factor * default.sample.lambda_pg).into();
+        let values = Values {
+            steps: self.step_counts.clone(),
+            lambda: self.lambdas.clone().unwrap_or_else(multiples),
+            scale: self.scales.clone(),
+            inputs: self.input_counts.clone(),
+            solvers: self.solvers.clone(),
+        };
+        let plan = |variant: Variant| {
+            let options = apply(&variant, default)?;
+            let count = variant.inputs.unwrap_or(inputs);
+            let same = options.sample == default.sample && count == inputs;
+            Ok((variant, (!same).then_some((options, count))))
+        };
+        variants(&self.sets, &values).into_iter().map(plan).collect()
+    }
+
+    /// Writes the study into the folder and prints it.
+    fn write(&self, study: &Study, environment: &freerange_eval::Environment) -> Result<(), CliError> {
+        let markdown = document(study, environment);
+        let write = |name: &str, text: &str| {
+            let path = self.output.join(name);
+            freerange_core::write_atomically(&path, |f| std::io::Write::write_all(f, text.as_bytes()))
+                .map_err(|e| CliError::file(&path, e))
+        };
+        let json = serde_json::to_string_pretty(study).map_err(CliError::input)?;
+        write("ablations.md", &markdown)?;
+        write("ablations.json", &json)?;
+        match self.json {
+            true => println!("{json}"),
+            false => println!("{markdown}\n{}", self.output.join("ablations.md").display()),
+        }
+        Ok(())
+    }
 }
 
 /// The default with what a variant changes.

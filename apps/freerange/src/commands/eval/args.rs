@@ -3,6 +3,7 @@
 use std::{path::PathBuf, sync::Arc};
 
 use freerange::{Device, checkpoint_sha256, machine};
+use freerange_core::Share;
 use freerange_eval::{
     Environment, Scorer, ScorerConfig,
     record::ViewSet,
@@ -73,8 +74,8 @@ pub struct RunArgs {
     pub pictures: Pictures,
     /// Work on share I of N only (from 0) and write no report: several processes or devices can fill one folder. Run once
     /// more without it at the end.
-    #[arg(long, value_name = "I/N", value_parser = share)]
-    pub share: Option<(usize, usize)>,
+    #[arg(long, value_name = "I/N")]
+    pub share: Option<Share>,
 }
 
 /// From where the input views look.
@@ -117,14 +118,6 @@ impl From<Pictures> for runner::Pictures {
             Pictures::Extremes => Self::Extremes,
             Pictures::All => Self::All,
         }
-    }
-}
-
-fn share(text: &str) -> Result<(usize, usize), String> {
-    let parts = text.split_once('/').and_then(|(i, n)| Some((i.parse().ok()?, n.parse().ok()?)));
-    match parts {
-        Some((i, n)) if i < n => Ok((i, n)),
-        _ => Err("expected I/N with I from 0 to N - 1, as in 0/4".into()),
     }
 }
 
@@ -200,7 +193,7 @@ impl RunArgs {
             objects: Box::new(source),
             scorer,
             pictures: self.pictures.into(),
-            share: self.share.unwrap_or((0, 1)),
+            share: self.share.unwrap_or_default(),
             commit: commit(),
         };
         Ok((shared, settings))

@@ -24,7 +24,6 @@ pub struct Args {
     json: bool,
 }
 
-/// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
     let (a, b) = (Report::load(&args.a)?, Report::load(&args.b)?);
     let comparisons = compare(&a, &b, args.seed)?;

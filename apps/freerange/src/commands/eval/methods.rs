@@ -9,7 +9,7 @@ use std::{
 use freerange::{FrameConfig, Options, Reconstructor, Up, View, to_canonical, to_user};
 use freerange_eval::{
     record::{Case, ViewSet},
-    runner::{self, Made},
+    runner::{self, Reconstructed},
 };
 use freerange_fit::{FitConfig, Rates, fit};
 use freerange_splat::{Cloud, read_ply};
@@ -88,7 +88,7 @@ impl runner::Method for Method {
         }
     }
 
-    fn make(&self, case: &Case, inputs: &[View]) -> Result<Made, String> {
+    fn make(&self, case: &Case, inputs: &[View]) -> Result<Reconstructed, String> {
         self.gaussians(case, inputs).map_err(|e| e.to_string())
     }
 }
@@ -109,7 +109,7 @@ impl Method {
         }
     }
 
-    fn gaussians(&self, case: &Case, inputs: &[View]) -> Result<Made, CliError> {
+    fn gaussians(&self, case: &Case, inputs: &[View]) -> Result<Reconstructed, CliError> {
         let mut notes = Vec::new();
         let clouds = match self {
             Self::Model { model, options, .. } => {
@@ -136,7 +136,7 @@ impl Method {
                 vec![(0, file.cloud)]
             }
         };
-        Ok(Made { clouds, notes })
+        Ok(Reconstructed { clouds, notes })
     }
 }
 

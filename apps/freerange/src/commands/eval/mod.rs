@@ -41,7 +41,6 @@ enum Command {
     Ablations(Box<ablations::Args>),
 }
 
-/// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
     match &args.command {
         Some(Command::Compare(args)) => compare::run(args),

@@ -5,8 +5,9 @@ use std::{
     path::{Path, PathBuf},
 };
 
+use freerange_build::{BuildConfig, Item, Items, render_views};
 use freerange_camera::{Scene, View};
-use freerange_data::{BuildConfig, Item, Items, ObjectSource, Shards, Split, Store, render_views};
+use freerange_data::{ObjectSource, Shards, Split, Store};
 use freerange_eval::{EvalObject, runner::Objects};
 use freerange_flow::config::TrainConfig;
 use serde_json::{Value, json};

@@ -1,0 +1,155 @@
+//! Many scenes at once, and photos held out: the real binary on real files.
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    process::{Command, Output},
+    time::SystemTime,
+};
+
+use serde_json::Value;
+
+fn freerange(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_freerange")).args(args).output().unwrap()
+}
+
+fn example() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/bowl")
+}
+
+fn copy(from: &Path, to: &Path) {
+    fs::create_dir_all(to).unwrap();
+    for entry in fs::read_dir(from).unwrap() {
+        let entry = entry.unwrap();
+        let target = to.join(entry.file_name());
+        match entry.file_type().unwrap().is_dir() {
+            true => copy(&entry.path(), &target),
+            false => drop(fs::copy(entry.path(), target).unwrap()),
+        }
+    }
+}
+
+/// Makes the scenes of a list as quickly as can be; the exit code, the table, and what was said.
+fn made(list: &Path, out: &Path, more: &[&str]) -> (i32, Vec<Value>, String) {
+    let mut args = vec!["reconstruct", "--list", list.to_str().unwrap(), "-o", out.to_str().unwrap(), "--json"];
+    args.extend(["--steps", "1", "--refine", "0"]);
+    args.extend(more);
+    let done = freerange(&args);
+    let said = String::from_utf8_lossy(&done.stderr).into_owned();
+    (done.status.code().unwrap(), serde_json::from_slice(&done.stdout).unwrap_or_default(), said)
+}
+
+fn changed(file: &Path) -> SystemTime {
+    fs::metadata(file).unwrap().modified().unwrap()
+}
+
+fn column<'a>(rows: &'a [Value], name: &str) -> Vec<&'a str> {
+    rows.iter().map(|r| r[name].as_str().unwrap()).collect()
+}
+
+#[test]
+fn many_scenes_are_made_once_and_a_bad_one_ends_none() {
+    let place = tempfile::tempdir().unwrap();
+    let (list, out) = (place.path().join("list.txt"), place.path().join("out"));
+    for name in ["a/bowl", "b/bowl"] {
+        copy(&example(), &place.path().join(name));
+    }
+    fs::create_dir(place.path().join("empty")).unwrap();
+    fs::write(&list, "# three scenes\na/bowl\n\nempty\n  b/bowl  \n").unwrap();
+
+    // The bad one in the middle is told of, and ends nothing.
+    let (code, rows, said) = made(&list, &out, &[]);
+    assert_eq!(code, 2, "{said}");
+    assert_eq!(column(&rows, "scene"), ["a-bowl", "empty", "b-bowl"]);
+    assert_eq!(column(&rows, "status"), ["done", "failed", "done"]);
+    assert!(rows[1]["error"].as_str().unwrap().contains("an empty folder"), "{}", rows[1]);
+    assert!(said.contains("1 of 3 scenes failed: empty"), "{said}");
+    assert!(rows[0]["further_views"]["psnr"].as_f64().unwrap() > 5.0);
+    assert_eq!(rows[0]["further_views"]["views"], 4);
+    for file in ["gaussians.ply", "turntable.gif", "report.json", "inputs", "scene.json"] {
+        assert!(out.join("a-bowl").join(file).exists(), "{file}");
+    }
+    assert!(!out.join("empty").exists());
+    let table: Vec<Value> = serde_json::from_slice(&fs::read(out.join("scenes.json")).unwrap()).unwrap();
+    assert_eq!(table, rows);
+
+    // Again: only what was missing is made, and of the others the numbers stay.
+    fs::remove_dir(place.path().join("empty")).unwrap();
+    copy(&example(), &place.path().join("empty"));
+    let before = changed(&out.join("a-bowl/gaussians.ply"));
+    let (code, again, said) = made(&list, &out, &[]);
+    assert_eq!((code, column(&again, "status")), (0, vec!["kept", "done", "kept"]), "{said}");
+    assert_eq!(again[0]["further_views"], rows[0]["further_views"]);
+    assert_eq!(changed(&out.join("a-bowl/gaussians.ply")), before);
+
+    // A photo that changes makes its scene new.
+    let photo = place.path().join("b/bowl/train/000.png");
+    let file = fs::File::options().append(true).open(&photo).unwrap();
+    file.set_modified(SystemTime::now() + std::time::Duration::from_secs(5)).unwrap();
+    let (_, third, said) = made(&list, &out, &[]);
+    assert_eq!(column(&third, "status"), ["kept", "kept", "done"], "{said}");
+
+    // Other options are refused before anything is made, unless all is to be made anew.
+    let (code, _, said) = made(&list, &out, &["--seed", "3"]);
+    assert_eq!(code, 2);
+    assert!(
+        said.contains("scene.json") && said.contains("`seeds`: expected [0]") && said.contains("--restart"),
+        "{said}"
+    );
+    assert_eq!(changed(&out.join("a-bowl/gaussians.ply")), before);
+    let (code, rows, said) = made(&list, &out, &["--seed", "3", "--restart", "--share", "0/2"]);
+    assert_eq!((code, column(&rows, "scene")), (0, vec!["a-bowl", "b-bowl"]), "{said}");
+    assert_eq!(column(&rows, "status"), ["done", "done"]);
+    assert!(out.join("scenes-0-of-2.json").exists());
+    let (_, rows, _) = made(&list, &out, &["--seed", "3", "--restart", "--share", "1/2"]);
+    assert_eq!(column(&rows, "scene"), ["empty"]);
+}
+
+#[test]
+fn what_cannot_be_a_list_of_scenes_is_refused() {
+    let place = tempfile::tempdir().unwrap();
+    let says = |args: &[&str], words: &[&str]| {
+        let out = place.path().join("out");
+        let done = freerange(&[&["reconstruct", "-o", out.to_str().unwrap()], args].concat());
+        let said = String::from_utf8_lossy(&done.stderr).into_owned();
+        assert_eq!(done.status.code(), Some(2), "{said}");
+        words.iter().for_each(|w| assert!(said.contains(w), "expected {w:?} in: {said}"));
+        assert!(!out.exists());
+    };
+    let (list, bowl) = (place.path().join("list"), example());
+    let (list_name, bowl) = (list.to_str().unwrap(), bowl.to_str().unwrap());
+    says(&[], &["SCENE"]);
+    says(&["--list", list_name], &["list"]);
+    fs::write(&list, "# nothing\n").unwrap();
+    says(&["--list", list_name], &["expected a scene on each line"]);
+    says(&[bowl, bowl], &["bowl", "every scene once"]);
+    says(&[bowl, "elsewhere", "--validate", bowl], &["--validate", "one scene"]);
+    says(&[bowl, "--restart"], &["--restart", "several scenes"]);
+    says(&[bowl, "--share", "2/2"], &["0 to N - 1"]);
+}
+
+#[test]
+fn photos_held_out_are_compared_with_and_not_used() {
+    let place = tempfile::tempdir().unwrap();
+    let out = place.path().join("out");
+    let args = |holdout: &'static str| {
+        let (scene, out) = (example().to_str().unwrap().to_owned(), out.to_str().unwrap().to_owned());
+        let words =
+            ["reconstruct", &scene, "-o", &out, "--steps", "1", "--refine", "2", "--json", "--holdout", holdout];
+        words.map(ToOwned::to_owned)
+    };
+    let run = |holdout: &'static str| freerange(&args(holdout).each_ref().map(String::as_str));
+    let done = run("001,003.png");
+    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    let report: Value = serde_json::from_slice(&done.stdout).unwrap();
+    assert_eq!(report["held_out"], serde_json::json!(["001", "003"]));
+    assert_eq!(report["views_shown"], serde_json::json!(["000", "002"]));
+    // The scene's own four further views, and these two; which are not among the inputs.
+    let sample = &report["samples"][0];
+    assert_eq!(sample["further_views"]["views"].as_array().unwrap().len(), 6);
+    assert_eq!(sample["input_views"]["views"].as_array().unwrap().len(), 2);
+    assert!(!out.join("inputs/001.png").exists() && out.join("inputs/000.png").exists());
+    let done = run("3");
+    let said = String::from_utf8_lossy(&done.stderr).into_owned();
+    assert!(done.status.code() == Some(2) && said.contains("at most 2 of 4 photos, found 3"), "{said}");
+}

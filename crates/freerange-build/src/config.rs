@@ -1,0 +1,110 @@
+//! What a folder of shards is told.
+
+use freerange_camera::SelectionConfig;
+use freerange_core::{Invalid, check};
+use freerange_data::ImageFormat;
+use freerange_data::layout::MAX_DEPTH;
+use freerange_mesh::LoadLimits;
+
+use crate::{BuildError, ObjectConfig};
+
+/// What is stored of each object, and how objects are divided.
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ShardConfig {
+    /// Objects per shard; the last one may have fewer.
+    pub objects_per_shard: u64,
+    /// Format of the views.
+    pub images: ImageFormat,
+    /// Whether the Gaussians before the tree are stored, too: other depths can then be had without another fit.
+    pub leaves: bool,
+    /// Views per object, from cameras of their own, that Gaussians are measured against and that are not stored. 0
+    /// measures nothing.
+    pub held_out: usize,
+    /// Objects whose Gaussians before the tree have less PSNR than this, in dB, are flagged: they stay in the shard, but
+    /// count neither for the statistics nor for training.
+    pub min_psnr: f64,
+    /// Share of objects for validation. Which ones follows from their ids.
+    pub validation: f64,
+    /// Share of objects for testing.
+    pub test: f64,
+    /// The views that evaluation gives to a model, and those that it scores. Its seed is replaced by the object's.
+    /// Objects with fewer than `2 inputs + validation` views get no such sets.
+    pub selection: SelectionConfig,
+}
+
+impl Default for ShardConfig {
+    fn default() -> Self {
+        Self {
+            objects_per_shard: 64,
+            images: ImageFormat::Webp,
+            leaves: false,
+            held_out: 4,
+            min_psnr: 20.0,
+            validation: 0.01,
+            test: 0.01,
+            selection: SelectionConfig::default(),
+        }
+    }
+}
+
+impl ShardConfig {
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// [`Invalid`] with the field's name.
+    pub fn validate(&self) -> Result<(), Invalid> {
+        let per = self.objects_per_shard;
+        check((1..=1 << 20).contains(&per), "objects_per_shard", "1 to 2^20", per)?;
+        check(self.held_out <= 100, "held_out", "0 to 100", self.held_out)?;
+        check((0.0..=100.0).contains(&self.min_psnr), "min_psnr", "0 to 100", self.min_psnr)?;
+        let [v, t] = [self.validation, self.test];
+        let shares = (0.0..=1.0).contains(&v) && (0.0..=1.0).contains(&t) && v + t <= 1.0;
+        check(shares, "validation, test", "shares of at most 1 together", (v, t))?;
+        let s = &self.selection;
+        let counts = (2..=64).contains(&s.inputs) && (1..=1000).contains(&s.validation);
+        check(counts, "selection", "2 to 64 inputs and 1 to 1000 validation views", (s.inputs, s.validation))
+    }
+}
+
+/// Everything that decides on the bytes of a folder of shards, besides what its objects are made of.
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct BuildConfig {
+    /// Seed of what is drawn for the objects: cameras, light, fits, splits.
+    pub seed: u64,
+    /// Depths of the slices to keep, ascending.
+    pub depths: Vec<u32>,
+    /// What is stored.
+    pub shard: ShardConfig,
+    /// How an object is made.
+    pub object: ObjectConfig,
+    /// What mesh files may be like.
+    pub mesh: LoadLimits,
+}
+
+impl Default for BuildConfig {
+    fn default() -> Self {
+        Self {
+            seed: 0,
+            depths: vec![8, 9, 10, 11, 12],
+            shard: ShardConfig::default(),
+            object: ObjectConfig::default(),
+            mesh: LoadLimits::default(),
+        }
+    }
+}
+
+impl BuildConfig {
+    /// Checks every field.
+    ///
+    /// # Errors
+    /// As [`ObjectConfig::validate`].
+    pub fn validate(&self) -> Result<(), BuildError> {
+        let ascending = self.depths.is_sorted_by(|a, b| a < b) && self.depths.iter().all(|d| *d <= MAX_DEPTH);
+        let expected = format!("one or more ascending depths up to {MAX_DEPTH}");
+        check(ascending && !self.depths.is_empty(), "depths", &expected, &self.depths)?;
+        self.shard.validate()?;
+        self.object.validate()
+    }
+}
