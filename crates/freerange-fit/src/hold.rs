@@ -17,7 +17,7 @@ const FULL_SIZE: f32 = 512.0;
 /// Differences of colours that are rounding.
 const EQUAL: f32 = 1e-6;
 
-/// Pictures of a cloud from all around it.
+/// Pictures of one cloud, or the mean of several, from all around it.
 pub(crate) struct Hold {
     pictures: Vec<Picture>,
     raster: RasterConfig,
@@ -44,12 +44,19 @@ fn cameras(config: &HoldConfig) -> impl Iterator<Item = Camera> + '_ {
 }
 
 impl Hold {
-    /// Pictures of `start`; none where they would have no weight.
-    pub fn new(start: &Cloud, config: &HoldConfig) -> Result<Self, FitError> {
+    /// The mean pictures of `clouds`; none where they would have no weight.
+    pub fn new(clouds: &[&Cloud], config: &HoldConfig) -> Result<Self, FitError> {
         let raster = RasterConfig::default().shrunk(config.size as f32 / FULL_SIZE);
+        let pixels = (config.size * config.size) as usize;
+        let share = 1.0 / clouds.len() as f32;
         let picture = |camera| {
-            let out = render(start.rows(), &[camera], &[[0.0; 3]], &raster)?;
-            Ok(Picture { camera, rgb: out.rgb, alpha: out.alpha })
+            let (mut rgb, mut alpha) = (vec![0.0; 3 * pixels], vec![0.0; pixels]);
+            for cloud in clouds {
+                let out = render(cloud.rows(), &[camera], &[[0.0; 3]], &raster)?;
+                rgb.iter_mut().zip(&out.rgb).for_each(|(sum, x)| *sum += share * x);
+                alpha.iter_mut().zip(&out.alpha).for_each(|(sum, x)| *sum += share * x);
+            }
+            Ok(Picture { camera, rgb, alpha })
         };
         let wanted = if config.weight > 0.0 { usize::MAX } else { 0 };
         let pictures = cameras(config).take(wanted).map(picture).collect::<Result<_, FitError>>()?;

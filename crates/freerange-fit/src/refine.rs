@@ -16,7 +16,8 @@ use std::ops::ControlFlow;
 ///
 /// Few views say little of the rest of the object, and Gaussians that only they judge leave the object's surface. Hence a
 /// [`Hold`](crate::HoldConfig): at every step, a picture of the cloud as it was, from somewhere around the object, is one
-/// more view to agree with, though less. `progress` hears of every step, and ends with what there is by
+/// more view to agree with, though less. `others` are more clouds of the same object, of which nothing is kept but that these
+/// pictures are the mean of all: where guesses differ, their mean is nearer to the truth than most. `progress` hears of every step, and ends with what there is by
 /// `ControlFlow::Break`. The same input gives the same bytes.
 ///
 /// # Errors
@@ -24,6 +25,7 @@ use std::ops::ControlFlow;
 /// if the cloud is empty or not finite; or if the optimisation diverges.
 pub fn refine(
     cloud: &Cloud,
+    others: &[Cloud],
     views: &[View],
     config: &RefineConfig,
     progress: impl FnMut(&FitProgress) -> ControlFlow<()>,
@@ -33,7 +35,9 @@ pub fn refine(
     let start = checked(cloud, usize::MAX)?;
     let fit = config.fit(start.len());
     fit.check()?;
-    let hold = Hold::new(&start, &config.hold)?;
+    let others = others.iter().map(|other| checked(other, usize::MAX)).collect::<Result<Vec<_>, _>>()?;
+    let held: Vec<&Cloud> = std::iter::once(&start).chain(&others).collect();
+    let hold = Hold::new(&held, &config.hold)?;
     let mut rng = ChaCha8Rng::seed_from_u64(config.seed);
     // A stream of its own: the photos come in the same order with and without a hold.
     let mut hold_rng = ChaCha8Rng::seed_from_u64(config.seed);

@@ -52,7 +52,7 @@ fn a_real_object_is_fitted_and_refined() {
     }
     let before = psnr(&spoilt, &around);
     let start = Instant::now();
-    let refined = refine(&spoilt, &others, &RefineConfig::default(), |_| ControlFlow::Continue(())).unwrap();
+    let refined = refine(&spoilt, &[], &others, &RefineConfig::default(), |_| ControlFlow::Continue(())).unwrap();
     let (seen, unseen) = (psnr(&refined, &others), psnr(&refined, &around));
     let seconds = start.elapsed().as_secs_f64();
     println!(

@@ -228,7 +228,7 @@ pub struct OptimizerConfig {
     pub clip: f32,
     /// Decay of the moving average of the weights (reached gradually over the first steps).
     pub ema: f32,
-    /// Arithmetic of the blocks' linear layers, `f32` or `bf16`; weights and sums stay in 32 bits.
+    /// Arithmetic of the blocks, `f32`, `bf16` or `auto`, the faster on this device; weights and sums stay in 32 bits.
     pub compute: Compute,
     /// Keep only the input of each block, and compute the block again for its gradient: a fraction of the memory for a
     /// third more work.

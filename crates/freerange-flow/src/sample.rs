@@ -57,6 +57,14 @@ pub struct SampleConfig {
     pub compute: Compute,
     /// Steps of 3DGS-MCMC on the input views that follow ([`freerange_fit::refine`]); [`reconstruct`] itself takes none.
     pub refine: usize,
+    /// How many samples refinement is held at the mean pictures of, each from a fit and noise of its own; what is refined is the
+    /// first. [`reconstruct`] itself draws what it is asked for.
+    #[serde(skip_serializing_if = "is_one")]
+    pub ensemble: usize,
+    /// Steps of [`Solver::Hold`] that follow a sample from pure noise, with it in the place of a fit. [`reconstruct`] itself
+    /// takes none.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub mend: usize,
     /// What is different where a model that starts from fits by itself is asked to start from pure noise; left out: nothing.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub from_noise: Option<FromNoise>,
@@ -72,6 +80,9 @@ pub struct FromNoise {
     pub solver: Solver,
     /// [`SampleConfig::photometric`]
     pub photometric: f32,
+    /// [`SampleConfig::mend`]
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub mend: usize,
 }
 
 impl Default for SampleConfig {
@@ -92,19 +103,37 @@ impl Default for SampleConfig {
             coupling: Coupling::Independent,
             compute: Compute::F32,
             refine: 0,
+            ensemble: 1,
+            mend: 0,
             from_noise: None,
         }
     }
+}
+
+fn is_zero(x: &usize) -> bool {
+    *x == 0
+}
+
+fn is_one(x: &usize) -> bool {
+    *x == 1
 }
 
 impl SampleConfig {
     /// The same from pure noise: see [`from_noise`](Self::from_noise).
     pub fn without_start(mut self) -> Self {
         if let (Some(_), Some(noise)) = (self.start.take(), self.from_noise) {
-            let FromNoise { steps, solver, photometric } = noise;
-            self = Self { steps, solver, photometric, ..self };
+            let FromNoise { steps, solver, photometric, mend } = noise;
+            self = Self { steps, solver, photometric, mend, ..self };
         }
         self
+    }
+
+    /// How samples from pure noise are mended: see [`mend`](Self::mend); none if they are not.
+    pub fn mending(&self) -> Option<Self> {
+        let start = StartConfig { time: 0.0, noise: 0.0, ..StartConfig::default() };
+        let held =
+            Self { steps: self.mend, solver: Solver::Hold, start: Some(start), photometric: 0.0, ..self.clone() };
+        (self.mend > 0 && self.start.is_none()).then_some(held)
     }
 
     /// Refuses impossible values.
@@ -118,8 +147,14 @@ impl SampleConfig {
         if self.depth.is_some_and(|d| !(1..=20).contains(&d)) {
             return bad("depth", "1 to 20", format!("{:?}", self.depth));
         }
+        if self.mend > 10_000 {
+            return bad("mend", "0 to 10000", self.mend.to_string());
+        }
         if self.refine > 100_000 {
             return bad("refine", "0 to 100000", self.refine.to_string());
+        }
+        if !(1..=64).contains(&self.ensemble) {
+            return bad("ensemble", "1 to 64", self.ensemble.to_string());
         }
         if self.solver == Solver::Hold && self.start.is_none() {
             return bad("solver", "euler, heun or multistep without sample.start", "hold".into());
@@ -554,7 +589,7 @@ mod tests {
 
     #[test]
     fn a_model_of_fits_starts_from_noise_in_its_own_way() {
-        let noise = FromNoise { steps: 30, solver: Solver::Multistep, photometric: 0.2 };
+        let noise = FromNoise { steps: 30, solver: Solver::Multistep, photometric: 0.2, mend: 3 };
         let fit = SampleConfig {
             steps: 4,
             solver: Solver::Hold,
@@ -568,6 +603,12 @@ mod tests {
         found.validate().unwrap();
         assert_eq!((found.steps, found.solver, found.photometric), (30, Solver::Multistep, 0.2));
         assert!(found.start.is_none());
+        // What comes of it takes the place of a fit; what starts from a fit has no need.
+        let mending = found.mending().unwrap();
+        mending.validate().unwrap();
+        assert_eq!((mending.steps, mending.solver, mending.photometric), (3, Solver::Hold, 0.0));
+        assert!(mending.start.is_some_and(|start| start.time == 0.0 && start.noise == 0.0));
+        assert!(fit.mending().is_none());
         assert_eq!(found.clone().without_start(), found);
         let held = SampleConfig { from_noise: None, ..fit }.without_start();
         let message = held.validate().unwrap_err().to_string();

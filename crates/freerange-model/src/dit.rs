@@ -5,7 +5,7 @@
 
 use burn::{
     module::{Module, Param},
-    tensor::{Tensor, TensorData, activation::silu},
+    tensor::{Device, Tensor, TensorData, activation::silu},
 };
 
 use crate::{
@@ -273,6 +273,10 @@ impl Dit {
     /// In which precision the blocks compute; the few layers outside of them stay in f32.
     pub fn set_compute(&mut self, compute: Compute) {
         self.compute = compute;
+    }
+
+    pub(crate) fn device(&self) -> Device {
+        self.registers.val().device()
     }
 
     pub(crate) fn compute(&self) -> Compute {

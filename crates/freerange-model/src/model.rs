@@ -85,6 +85,7 @@ impl FreeRange {
     /// The same model, computing this way: the transformer's blocks, and on a GPU a frozen DINOv2 too. Whether a
     /// device can, [`Compute::supported`] tells.
     pub fn with_compute(mut self, compute: Compute) -> Self {
+        let compute = compute.on(&self.dit.device());
         self.dit.set_compute(compute);
         self.encoder.set_compute(compute);
         self

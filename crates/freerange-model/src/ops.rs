@@ -3,6 +3,8 @@
 //! Each has two implementations: [`reference`], a few lines of tensor operations that say what is computed, and
 //! [`crate::kernels`], fused, with hand-written gradients. Tests hold the second to the first.
 
+use std::{fmt, sync::OnceLock, time::Instant};
+
 use burn::{
     backend::Dispatch,
     tensor::{DType, Device, FloatDType, Tensor},
@@ -25,38 +27,89 @@ pub enum Compute {
     #[default]
     F32,
     /// In bf16. On a GPU: operands of products and the activations between them. On a CPU: operands of products on
-    /// Intel's tiles (AMX, on Linux), of linear layers' products with AVX-512 BF16 instructions, f32 without either.
+    /// Intel's tiles (AMX, on Linux) or with AVX-512 BF16 instructions, f32 without either.
     Bf16,
     /// In f16, on GPUs without bf16. For inference: small gradients vanish. On a CPU: f32.
     F16,
+    /// In bf16 where that is faster, else in f32: see [`Compute::on`].
+    Auto,
 }
 
+/// How much faster bf16 has to be for [`Compute::Auto`]: it rounds.
+const WORTHWHILE: f64 = 1.2;
+
 impl Compute {
+    /// What [`Auto`](Self::Auto) means on a device; the others mean themselves. A GPU that has bf16 computes in it. On a CPU a
+    /// product is timed both ways, once per process (some processors have instructions for bf16 that are slower than those
+    /// for f32).
+    pub fn on(self, device: &Device) -> Self {
+        match self {
+            Self::Auto if is_cpu(device) => match cpu_ratio() > WORTHWHILE {
+                true => Self::Bf16,
+                false => Self::F32,
+            },
+            Self::Auto if Self::Bf16.supported(device) => Self::Bf16,
+            Self::Auto => Self::F32,
+            chosen => chosen,
+        }
+    }
+
     /// Whether a device can compute this way. A CPU takes [`Bf16`](Self::Bf16) as leave to use it where it can, and
     /// has no use for [`F16`](Self::F16).
     pub fn supported(self, device: &Device) -> bool {
         match self {
-            Self::F32 => true,
+            Self::F32 | Self::Auto => true,
             Self::Bf16 if is_cpu(device) => true,
             Self::F16 if is_cpu(device) => false,
             Self::Bf16 | Self::F16 => device.supports_dtype(self.dtype()),
         }
     }
 
-    /// The type of activations on a GPU.
+    /// The type of activations on a GPU. What is automatic has been [chosen](Self::on) before.
     pub(crate) fn dtype(self) -> DType {
         match self {
-            Self::F32 => DType::F32,
+            Self::F32 | Self::Auto => DType::F32,
             Self::Bf16 => DType::BF16,
             Self::F16 => DType::F16,
         }
     }
 }
 
+/// As configurations name it.
+impl fmt::Display for Compute {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::F32 => "f32",
+            Self::Bf16 => "bf16",
+            Self::F16 => "f16",
+            Self::Auto => "auto",
+        })
+    }
+}
+
+/// How many times as fast as in f32 this CPU multiplies in bf16: the better of a few products of a small model's size.
+fn cpu_ratio() -> f64 {
+    static RATIO: OnceLock<f64> = OnceLock::new();
+    *RATIO.get_or_init(|| {
+        let ones = |shape: [usize; 2]| Tensor::<2>::ones(shape, &Device::flex());
+        let (x, w, b) =
+            (ones([1, 512 * 384]).reshape([1, 512, 384]), ones([1152, 384]), Tensor::ones([1152], &Device::flex()));
+        let best = |compute: Compute| {
+            let once = || {
+                let begin = Instant::now();
+                linear(x.clone(), w.clone(), b.clone(), compute).into_data();
+                begin.elapsed().as_secs_f64()
+            };
+            (0..6).map(|_| once()).fold(f64::INFINITY, f64::min)
+        };
+        best(Compute::F32) / best(Compute::Bf16)
+    })
+}
+
 /// As activations between operations are on a GPU.
 pub(crate) fn activation<const D: usize>(t: Tensor<D>, compute: Compute) -> Tensor<D> {
     match compute {
-        Compute::F32 => t,
+        Compute::F32 | Compute::Auto => t,
         Compute::Bf16 => t.cast(FloatDType::BF16),
         Compute::F16 => t.cast(FloatDType::F16),
     }
@@ -139,7 +192,7 @@ pub(crate) mod reference {
 
     pub fn linear<const D: usize>(x: Tensor<D>, w: Tensor<2>, b: Tensor<1>, compute: Compute) -> Tensor<D> {
         match compute {
-            Compute::F32 => burn_linear(x, w.transpose(), Some(b)),
+            Compute::F32 | Compute::Auto => burn_linear(x, w.transpose(), Some(b)),
             Compute::Bf16 => half_linear(x, w, b, FloatDType::BF16),
             Compute::F16 => half_linear(x, w, b, FloatDType::F16),
         }
@@ -198,5 +251,26 @@ pub(crate) mod reference {
         });
         let mixed = scaled_dot_product(q, k, v, None, None, AttentionModuleOptions::default());
         mixed.swap_dims(1, 2).reshape([b, t, heads * width])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_automatic_is_chosen_once() {
+        let device = Device::flex();
+        for chosen in [Compute::F32, Compute::Bf16, Compute::F16] {
+            assert_eq!(chosen.on(&device), chosen);
+        }
+        let found = Compute::Auto.on(&device);
+        assert!([Compute::F32, Compute::Bf16].contains(&found) && found.supported(&device));
+        assert_eq!(Compute::Auto.on(&device.autodiff()), found);
+        assert_eq!(found == Compute::Bf16, cpu_ratio() > WORTHWHILE);
+        for name in ["f32", "bf16", "f16", "auto"] {
+            let compute: Compute = serde_json::from_value(name.into()).unwrap();
+            assert_eq!(compute.to_string(), name);
+        }
     }
 }

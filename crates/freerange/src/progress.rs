@@ -62,7 +62,7 @@ impl<'a> Progress<'a> {
     }
 
     /// While sampling: what the network takes the clean Gaussians of each sample to be, in the frame of the views. None in
-    /// other stages and when sampling begins. Costs a copy; on a GPU it waits for the step.
+    /// other stages, when sampling begins, and for what is sampled only to help (`sample.ensemble`). Costs a copy; on a GPU it waits for the step.
     ///
     /// # Errors
     /// If a device fails.

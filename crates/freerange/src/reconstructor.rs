@@ -4,8 +4,8 @@ use std::{ops::ControlFlow, path::Path, time::Instant};
 
 use burn::tensor::Device;
 use freerange_camera::{CanonicalFrame, FrameConfig, Similarity, View, canonical_from_user, inputs_around};
-use freerange_fit::{FitProgress, RefineConfig, frame_of, quick_fit, refine, tree_slice};
-use freerange_flow::sample::{SampleConfig, reconstruct};
+use freerange_fit::{FitProgress, HoldConfig, RefineConfig, frame_of, quick_fit, refine, tree_slice};
+use freerange_flow::sample::{Estimate, SampleConfig, StartConfig, reconstruct};
 use freerange_model::Checkpoint;
 use freerange_splat::Cloud;
 
@@ -153,14 +153,17 @@ impl Reconstructor {
         }
         seconds.push((Stage::Frame, begin.elapsed().as_secs_f64()));
 
+        // Samples that nothing is made of have no use for others beside them.
+        let members = if options.sample.refine > 0 { options.sample.ensemble } else { 1 };
         let begin = Instant::now();
-        let fit = match &options.sample.start {
-            None => None,
-            Some(start) => {
-                let mut fit =
-                    watched(Stage::Fit, 0, &mut tell, start.fit.iterations, |p| quick_fit(&shown, &start.fit, 0, p))?;
+        let mut fits = Vec::new();
+        if let Some(StartConfig { fit: config, .. }) = &options.sample.start {
+            for member in 0..members {
+                let done = [member * config.iterations, members * config.iterations];
+                let seed = member as u64;
+                let mut fit = watched(Stage::Fit, 0, &mut tell, done, |p| quick_fit(&shown, config, seed, p))?;
                 // The fit knows better than the masks where the object is; it moves along, so that one is enough.
-                if !frame.kept {
+                if member == 0 && !frame.kept {
                     let correction = frame_of(&fit, &shown)?;
                     fit.transform(correction.scale, correction.rotation, correction.translation);
                     canonical = moved(&canonical, &correction);
@@ -169,42 +172,43 @@ impl Reconstructor {
                     let (shift, scale) = (correction.translation.length(), correction.scale);
                     frame.notes.push(format!("the quick fit moved it by {shift:.3} and scaled it by {scale:.3}"));
                 }
-                seconds.push((Stage::Fit, begin.elapsed().as_secs_f64()));
-                Some(fit)
+                fits.push(fit);
             }
-        };
+            seconds.push((Stage::Fit, begin.elapsed().as_secs_f64()));
+        }
         let canonical_from_user = frame.canonical_from_user;
 
         let begin = Instant::now();
-        let clouds = match (&fit, options.without_network) {
-            (Some(fit), true) => {
-                let slice = tree_slice(fit, options.sample.depth.unwrap_or(self.checkpoint.depth))?;
-                vec![slice; options.seeds.len()]
-            }
-            _ => {
-                let total = options.sample.steps;
-                tell(&Progress::new(Stage::Sample, 0, total))?;
-                let fits = fit.as_ref().map(std::slice::from_ref);
-                let (config, seeds) = (&options.sample, &options.seeds);
-                let sampled =
-                    reconstruct(&self.checkpoint, &[&shown], fits, config, seeds, &self.device, |estimate| {
-                        let told = Progress::new(Stage::Sample, estimate.index + 1, total);
-                        let told = Progress { estimate: Some((estimate, &canonical_from_user)), ..told };
-                        tell(&told).map_or(ControlFlow::Break(()), ControlFlow::Continue)
-                    })?;
-                sampled.into_iter().flatten().collect()
-            }
-        };
+        let (steps, total) = (options.sample.steps, members * options.sample.steps);
+        tell(&Progress::new(Stage::Sample, 0, total))?;
+        let mut clouds = vec![Vec::with_capacity(members); options.seeds.len()]; // [seeds][members]
+        for member in 0..members {
+            let told = |estimate: &Estimate<'_>| {
+                let told = Progress::new(Stage::Sample, member * steps + estimate.index + 1, total);
+                // The other members only help the first.
+                tell(&Progress { estimate: (member == 0).then_some((estimate, &canonical_from_user)), ..told })
+            };
+            let sampled = self.sample(&shown, fits.get(member), options, member as u64, told)?;
+            clouds.iter_mut().zip(sampled).for_each(|(members, cloud)| members.push(cloud));
+        }
         seconds.push((Stage::Sample, begin.elapsed().as_secs_f64()));
 
         let begin = Instant::now();
         let mut samples = Vec::with_capacity(clouds.len());
-        for (i, (&seed, plain)) in options.seeds.iter().zip(clouds).enumerate() {
+        for (i, (&seed, mut members)) in options.seeds.iter().zip(clouds).enumerate() {
+            let plain = members.remove(0);
             let refined = match options.sample.refine {
                 0 => None,
                 steps => {
-                    let config = RefineConfig { steps, seed, ..RefineConfig::default() };
-                    Some(watched(Stage::Refine, i, &mut tell, steps, |p| refine(&plain, &canonical, &config, p))?)
+                    // What several agree on is held more firmly than a guess.
+                    let hold = match members.is_empty() {
+                        true => HoldConfig::default(),
+                        false => HoldConfig { weight: 0.3, views: 24, ..HoldConfig::default() },
+                    };
+                    let config = RefineConfig { steps, hold, seed, ..RefineConfig::default() };
+                    let refined =
+                        |p: &mut dyn FnMut(&FitProgress) -> _| refine(&plain, &members, &canonical, &config, p);
+                    Some(watched(Stage::Refine, i, &mut tell, [0, steps], refined)?)
                 }
             };
             let (canonical, unrefined) = match refined {
@@ -217,6 +221,40 @@ impl Reconstructor {
             seconds.push((Stage::Refine, begin.elapsed().as_secs_f64()));
         }
         Ok(Reconstruction { samples, shown: chosen, canonical_from_user, notes: frame.notes, seconds })
+    }
+
+    /// One cloud per seed, of member `member` of an ensemble, for views in the canonical frame and their quick fit, if
+    /// sampling starts from one.
+    fn sample(
+        &self,
+        views: &[View],
+        fit: Option<&Cloud>,
+        options: &Options,
+        member: u64,
+        mut told: impl FnMut(&Estimate<'_>) -> Result<(), Error>,
+    ) -> Result<Vec<Cloud>, Error> {
+        let config = &options.sample;
+        if let (Some(fit), true) = (fit, options.without_network) {
+            let slice = tree_slice(fit, config.depth.unwrap_or(self.checkpoint.depth))?;
+            return Ok(vec![slice; options.seeds.len()]);
+        }
+        let mut told = |estimate: &Estimate<'_>| told(estimate).map_or(ControlFlow::Break(()), ControlFlow::Continue);
+        // The first member is what it is without the others, which draw from far away.
+        let seeds: Vec<u64> = options.seeds.iter().map(|seed| seed.wrapping_add(member << 32)).collect();
+        let fits = fit.map(std::slice::from_ref);
+        let sampled = reconstruct(&self.checkpoint, &[views], fits, config, &seeds, &self.device, &mut told)?;
+        let mut clouds: Vec<Cloud> = sampled.into_iter().flatten().collect();
+        if let Some(mending) = config.mending() {
+            for (cloud, seed) in clouds.iter_mut().zip(&seeds) {
+                let (start, seeds) = (std::slice::from_ref(&*cloud), std::slice::from_ref(seed));
+                let mended =
+                    reconstruct(&self.checkpoint, &[views], Some(start), &mending, seeds, &self.device, |_| {
+                        ControlFlow::Continue(())
+                    })?;
+                *cloud = mended.into_iter().flatten().next().expect("one object, one seed");
+            }
+        }
+        Ok(clouds)
     }
 }
 
@@ -246,18 +284,20 @@ pub fn choose_views(views: &[View], most: usize) -> Result<Vec<usize>, Error> {
     }
 }
 
-/// A fit whose steps are told; what it has when it is stopped is of no use.
+/// A fit whose steps are told, as those after so many of so many; what it has when it is stopped is of no use.
 fn watched(
     stage: Stage,
     sample: usize,
     tell: &mut impl FnMut(&Progress<'_>) -> Result<(), Error>,
-    total: usize,
+    [before, total]: [usize; 2],
     fit: impl FnOnce(&mut dyn FnMut(&FitProgress) -> ControlFlow<()>) -> Result<Cloud, freerange_fit::FitError>,
 ) -> Result<Cloud, Error> {
-    tell(&Progress { sample, ..Progress::new(stage, 0, total) })?;
+    if before == 0 {
+        tell(&Progress { sample, ..Progress::new(stage, 0, total) })?;
+    }
     let mut stopped = Ok(());
     let cloud = fit(&mut |p| {
-        stopped = tell(&Progress { sample, loss: Some(p.loss), ..Progress::new(stage, p.step, total) });
+        stopped = tell(&Progress { sample, loss: Some(p.loss), ..Progress::new(stage, before + p.step, total) });
         if stopped.is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
     });
     stopped?;

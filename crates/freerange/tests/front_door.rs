@@ -23,6 +23,7 @@ fn short(model: &Reconstructor) -> Options {
     options.sample.steps = 3;
     options.seeds = vec![4, 5];
     options.sample.refine = 4;
+    options.sample.ensemble = 1;
     options
 }
 
@@ -83,6 +84,49 @@ fn every_step_is_told_and_the_last_estimate_is_the_result_in_the_users_frame() {
     let plain = model.run(&views, &options, &mut go).unwrap();
     assert!(plain.samples.iter().all(|s| s.unrefined.is_none()));
     assert_eq!(plain.samples[0].gaussians, unrefined[0]);
+}
+
+/// Members only help: the first sample is what it is without them, what comes of it is not.
+#[test]
+fn an_ensemble_holds_the_refinement_of_its_first_member() {
+    let model = model();
+    let views = bowl();
+    let mut options = short(&model);
+    options.seeds.truncate(1);
+    let alone = model.run(&views, &options, &mut go).unwrap();
+    options.sample.ensemble = 3;
+    let mut told = Vec::new();
+    let together = model
+        .run(&views, &options, &mut |p| {
+            told.push((p.stage, p.done, p.total, p.estimate().unwrap().map_or(0, |clouds| clouds.len())));
+            ControlFlow::Continue(())
+        })
+        .unwrap();
+    let fits = (0..=60).map(|done| (Stage::Fit, done, 60, 0));
+    let samples = (0..=9).map(|done| (Stage::Sample, done, 9, usize::from((1..=3).contains(&done))));
+    let expected: Vec<_> = fits.chain(samples).collect();
+    assert_eq!(told[1..1 + expected.len()], expected);
+    assert_eq!(alone.samples[0].unrefined, together.samples[0].unrefined);
+    assert_ne!(alone.samples[0].gaussians, together.samples[0].gaussians);
+    assert_eq!(alone.canonical_from_user, together.canonical_from_user);
+}
+
+/// From pure noise; what is mended starts from that sample and stays near it.
+#[test]
+fn a_sample_from_noise_is_mended() {
+    let model = model();
+    let views = bowl();
+    let mut options = short(&model);
+    options.seeds.truncate(1);
+    options.sample = SampleConfig { steps: 6, mend: 0, refine: 0, ..options.sample.without_start() };
+    let quality = |options: &Options| {
+        let made = model.run(&views, options, &mut go).unwrap();
+        score(&made.samples[0].gaussians, &views).unwrap().unwrap().psnr
+    };
+    let before = quality(&options);
+    options.sample.mend = 3;
+    let after = quality(&options);
+    assert!(after > before + 0.5, "{before} dB, mended {after} dB");
 }
 
 #[test]

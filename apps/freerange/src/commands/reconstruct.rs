@@ -91,6 +91,12 @@ pub struct Sampling {
     /// place where no view looks; 500 are enough, 0 is none [default: the checkpoint's].
     #[arg(long, value_name = "STEPS")]
     pub refine: Option<usize>,
+    /// Hold that refinement at the mean pictures of so many samples; 1 is the sample alone [default: the checkpoint's].
+    #[arg(long, value_name = "SAMPLES", value_parser = clap::value_parser!(u8).range(1..=64))]
+    pub ensemble: Option<u8>,
+    /// Mend a sample from pure noise in so many passes, as fits are mended; 0 is none [default: the checkpoint's].
+    #[arg(long, value_name = "PASSES")]
+    pub mend: Option<usize>,
     /// Seed of the (first) sample.
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
@@ -113,7 +119,8 @@ pub struct Sampling {
     /// [default: the checkpoint's].
     #[arg(long, value_parser = parse_solver)]
     pub solver: Option<Solver>,
-    /// Arithmetic of the transformer: f32, or bf16 or f16 where the device has it [default: the checkpoint's].
+    /// Arithmetic of the transformer: f32, bf16 or f16 where the device has it, or auto, the faster of the first two [default:
+    /// the checkpoint's].
     #[arg(long, value_parser = parse_compute)]
     pub compute: Option<Compute>,
     /// Which way is up in the scene's frame: z, y, cameras (where the tops of the photos point), a direction X,Y,Z, or auto:
@@ -147,9 +154,9 @@ fn share(text: &str) -> Result<(usize, usize), String> {
     }
 }
 
-/// `f32`, `bf16` or `f16`.
+/// `f32`, `bf16`, `f16` or `auto`.
 pub fn parse_compute(text: &str) -> Result<Compute, String> {
-    serde_json::from_value(text.into()).map_err(|_| "expected f32, bf16 or f16".into())
+    serde_json::from_value(text.into()).map_err(|_| "expected f32, bf16, f16 or auto".into())
 }
 
 impl Sampling {
@@ -180,6 +187,8 @@ impl Sampling {
         sample.solver = self.solver.unwrap_or(sample.solver);
         sample.compute = self.compute.unwrap_or(sample.compute);
         sample.refine = self.refine.unwrap_or(sample.refine);
+        sample.mend = self.mend.unwrap_or(sample.mend);
+        sample.ensemble = self.ensemble.map_or(sample.ensemble, usize::from);
         options.seeds = (0..u64::from(samples)).map(|i| self.seed.wrapping_add(i)).collect();
         options.frame.up = self.up.or_z();
         model.check(&options)?;

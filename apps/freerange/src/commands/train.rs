@@ -11,7 +11,7 @@ use freerange_flow::{
     trainer::{Initial, Report, Trainer, Validated},
 };
 
-use freerange_model::{Execution, FreeRange, ModelConfig, ModelInfo, Workload};
+use freerange_model::{Compute, Execution, FreeRange, ModelConfig, ModelInfo, Workload};
 
 use crate::{error::CliError, progress::Progress, runtime::local_or_shipped};
 
@@ -61,6 +61,9 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         Some(output) if !args.dry_run => output,
         _ => return dry_run(&config, &device),
     };
+    if config.optimizer.compute == Compute::Auto {
+        eprintln!("computing in {}", config.optimizer.compute.on(&device));
+    }
     let total = config.total_steps();
     let encoders = EncoderPlaces::at(args.encoder_weights.clone());
     let encoder = encoders.for_training(&config.model.encoder)?;

@@ -100,10 +100,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     let listed = devices().into_iter().find(|d| d.is(&device));
     let (name, hardware, gpu) = listed
         .map_or_else(|| (args.device.to_string(), "unknown".into(), false), |d| (d.name, d.properties.hardware, d.gpu));
-    let compute = args.compute.unwrap_or(match gpu && Compute::Bf16.supported(&device) {
-        true => Compute::Bf16,
-        false => Compute::F32,
-    });
+    let compute = args.compute.unwrap_or(Compute::Auto).on(&device);
     require(compute, &device)?;
     let sizes = match args.sizes.is_empty() {
         false => args.sizes.clone(),

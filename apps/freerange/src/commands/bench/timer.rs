@@ -45,7 +45,7 @@ impl Timer {
         let random = || {
             let x = Tensor::<2>::random([n, n], Distribution::Default, &self.device);
             match compute {
-                Compute::F32 => x,
+                Compute::F32 | Compute::Auto => x,
                 Compute::Bf16 => x.cast(FloatDType::BF16),
                 Compute::F16 => x.cast(FloatDType::F16),
             }

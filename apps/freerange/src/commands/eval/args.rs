@@ -150,6 +150,9 @@ impl RunArgs {
         if !samples && self.sampling.refine.is_some() {
             return refuse("--refine goes with --method model and start only");
         }
+        if !samples && self.sampling.ensemble.is_some() {
+            return refuse("--ensemble goes with --method model and start only");
+        }
         Ok(match self.method {
             MethodName::Model | MethodName::Start => {
                 let model = self.sampling.open(device)?;

@@ -167,11 +167,11 @@ type Forward = unsafe fn(&[f32], Option<Weights<'_>>, Sizes, usize, *mut f32, &m
 /// [`head_backward`].
 type Backward = unsafe fn(Saved<'_>, Option<Weights<'_>>, Sizes, usize, *mut f32) -> (Vec<f32>, Vec<f32>);
 
-/// In bf16 where asked for and the CPU has tiles; products as small as these gain nothing from vectors of bf16.
+/// In bf16 where asked for and the CPU has the instructions.
 fn by_head(bf16: bool) -> (Forward, Backward) {
     match bf16 {
-        #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
-        true if super::amx::available() => (super::amx::head_forward, super::amx::head_backward),
+        #[cfg(target_arch = "x86_64")]
+        true if super::tiles::available() => (super::tiles::head_forward, super::tiles::head_backward),
         _ => (head_forward, head_backward),
     }
 }

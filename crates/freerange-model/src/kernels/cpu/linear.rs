@@ -5,9 +5,9 @@ use gemm::Parallelism;
 use multiversion::multiversion;
 use rayon::prelude::*;
 
-#[cfg(all(target_arch = "x86_64", target_os = "linux"))]
-use super::amx;
-use super::{bf16, contiguous, dims, math, tensor, values};
+#[cfg(target_arch = "x86_64")]
+use super::tiles;
+use super::{contiguous, dims, math, tensor, values};
 
 /// A read-only matrix inside a slice: element (i, j) is `data[i * rows + j * columns]`.
 #[derive(Clone, Copy)]
@@ -87,11 +87,13 @@ fn parallelism(shape: [usize; 3]) -> Parallelism {
 
 /// `bias + a b`, with the bias added to every row; in bf16 where asked for and the CPU can.
 fn product(shape @ [m, k, n]: [usize; 3], a: Matrix, b: Matrix, bias: Option<&[f32]>, in_bf16: bool) -> Vec<f32> {
-    #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
-    if in_bf16 && amx::available() {
-        return amx::product(shape, a, b, bias);
+    #[cfg(target_arch = "x86_64")]
+    if in_bf16 && tiles::available() {
+        return tiles::product(shape, a, b, bias);
     }
-    if bias.is_none() && k > 0 && !(in_bf16 && bf16::available()) {
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = in_bf16; // no kernel of ours
+    if bias.is_none() && k > 0 {
         let mut out = Vec::with_capacity(m * n);
         // SAFETY: `out` has room for m rows of n values, all of which are written.
         unsafe {
@@ -106,13 +108,8 @@ fn product(shape @ [m, k, n]: [usize; 3], a: Matrix, b: Matrix, bias: Option<&[f
             piece.chunks_exact_mut(n).for_each(|row| row.copy_from_slice(bias));
         });
     }
-    if in_bf16 && bf16::available() {
-        bf16::product(shape, a, b, &mut out, bias.is_some());
-    } else {
-        let out = out.as_mut_ptr();
-        // SAFETY: `out` is ours and has m rows of n values.
-        unsafe { matmul(shape, a, b, 1.0, out, n, bias.is_some(), parallelism(shape)) }
-    }
+    // SAFETY: `out` is ours and has m rows of n values.
+    unsafe { matmul(shape, a, b, 1.0, out.as_mut_ptr(), n, bias.is_some(), parallelism(shape)) }
     out
 }
 

@@ -2,16 +2,15 @@
 //!
 //! Work is split into pieces whose number does not depend on the number of threads, and partial sums are added in
 //! order, so that results are the same on every machine with the same instruction set. Half precision means operands
-//! of products rounded to bf16, where the processor has instructions for that: a tile unit for those of linear layers and
-//! attention, or vectors for linear layers. All tensors are f32.
+//! of products rounded to bf16, where the processor has instructions for that: a tile unit or vectors of bf16. All tensors
+//! are f32.
 
-#[cfg(all(target_arch = "x86_64", target_os = "linux"))]
-mod amx;
 mod attention;
-mod bf16;
 mod linear;
 mod math;
 mod pointwise;
+#[cfg(target_arch = "x86_64")]
+mod tiles;
 
 use burn::{
     backend::{Flex, flex::FlexTensor},

@@ -83,6 +83,38 @@ fn products_are_those_of_rounded_numbers() {
     }
 }
 
+/// Where the processor has a tile unit, nothing else tries the vectors.
+#[test]
+fn vectors_multiply_as_well() {
+    if !available() {
+        return;
+    }
+    let [m, n] = [29, 31];
+    for k in [1, 31, 64, 300] {
+        let (a, b, row) = (random(m * k, 3), random(k * n, 4), random(n, 5));
+        let (a, b) = (Matrix::rows(&a, k), Matrix::rows(&b, n));
+        let (left, right) = (pack::Lines::left(a, m, k), pack::Lines::right(b, k, n));
+        let mut tiles = vec![Tile::ZERO; pack::tiles(m, k) + pack::tiles(n, k)];
+        let (left_tiles, right_tiles) = tiles.split_at_mut(pack::tiles(m, k));
+        left.pack(left_tiles);
+        right.pack(right_tiles);
+        let unit = Unit::of(Engine::Vectors);
+        let mut out = vec![0f32; m * n];
+        let mut check = |start: Start, expected: &dyn Fn(usize, f64) -> f64| {
+            let place = Place { out: out.as_mut_ptr(), stride: n, rows: m, columns: n };
+            // SAFETY: all of `out`, which is ours.
+            unsafe { unit.multiply(left_tiles, right_tiles, start, place) };
+            for (i, (found, truth)) in out.iter().zip(naive([m, k, n], a, b, None)).enumerate() {
+                let error = (f64::from(*found) - expected(i % n, truth)).abs();
+                assert!(error < 1e-6 * (1.0 + k as f64), "depth {k}, element {i}: off by {error}");
+            }
+        };
+        check(Start::Row(&row), &|column, x| x + f64::from(row[column]));
+        check(Start::Zeros, &|_, x| x);
+        check(Start::Result, &|_, x| 2.0 * x);
+    }
+}
+
 #[test]
 fn products_do_not_depend_on_the_number_of_threads() {
     if !available() {
