@@ -9,7 +9,10 @@ const ROOMS: &[(&str, &[&str])] = &[
     ("freerange-camera", &["freerange-core"]),
     ("freerange-scene", &["freerange-camera"]),
     ("freerange-formats", &["freerange-core", "freerange-splat"]),
-    ("freerange-serve", &["freerange-splat", "freerange-camera", "freerange-scene", "freerange-formats"]),
+    (
+        "freerange-serve",
+        &["freerange-core", "freerange-splat", "freerange-camera", "freerange-scene", "freerange-formats"],
+    ),
     ("freerange-hub", &["freerange-core"]),
     ("freerange-raster", &["freerange-camera"]),
     ("freerange-model", &["freerange-core", "freerange-splat"]),

@@ -175,11 +175,13 @@ fn warnings(views: &[ViewReport], sureness: Option<f64>) -> Vec<String> {
     if let Some(names) = listed(views, |v| v.cut_off) {
         warnings.push(format!("the object is cut off by the photo's border in {names}"));
     }
-    // A wrong mask takes from all others: what contradicts them most is named.
+    // A wrong mask takes from all others: those that contradict the rest most are named.
     let most = views.iter().map(|v| v.contradicts).fold(CONTRADICTS, f64::max);
-    let worst = |v: &ViewReport| v.contradicts > CONTRADICTS && v.contradicts >= 0.9 * most;
+    let worst = |v: &ViewReport| v.contradicts > CONTRADICTS && v.contradicts >= 0.6 * most;
     if let Some(names) = listed(views, |v| worst(v) || (most <= CONTRADICTS && v.doubtful())) {
-        warnings.push(format!("the masks of the other views disagree with {names}: a mask or a pose is wrong there"));
+        warnings.push(format!(
+            "the masks of the other views disagree with {names}: a mask or a pose is wrong there, or in one of them"
+        ));
     }
     if let Some(names) = listed(views, |v| v.covers < 0.01) {
         warnings

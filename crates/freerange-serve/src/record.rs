@@ -6,7 +6,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use freerange_splat::write_atomically;
+use freerange_core::write_atomically;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 

@@ -7,6 +7,7 @@ use std::{
 };
 
 use freerange_camera::{CameraError, FrameConfig, Similarity, Up, View, canonical_from_user};
+use freerange_core::write_atomically;
 use freerange_scene::{
     LoadConfig, Loaded, MaskSource, SceneError,
     inspect::{inspect, sheet},
@@ -14,7 +15,6 @@ use freerange_scene::{
     read::{Cameras, Turntable, cameras},
     up_of,
 };
-use freerange_splat::write_atomically;
 use image::{GrayImage, ImageFormat, ImageReader, Luma, Rgba, RgbaImage};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;

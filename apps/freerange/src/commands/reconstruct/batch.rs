@@ -8,7 +8,7 @@ use std::{
 };
 
 use freerange::{Reconstructor, Scores, checkpoint_sha256};
-use freerange_splat::write_atomically;
+use freerange_core::write_atomically;
 use serde::{Deserialize, Serialize};
 
 use super::{Args, Report};
