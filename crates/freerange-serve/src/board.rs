@@ -391,9 +391,11 @@ impl Board {
 
     /// Stops a job. Whoever computes it hears of it at the next step.
     pub fn cancel(&self, id: &str) -> Result<(), Refusal> {
+        let mut unread = None;
         self.change(id, |job| {
             match job.record.state {
-                State::Reading | State::Queued | State::Running => {}
+                State::Reading => unread = Some(uploads(&job.folder)),
+                State::Queued | State::Running => {}
                 state => return Err(Refusal::new(409, format!("this job is {}", state.name()))),
             }
             job.record.state = State::Cancelled;
@@ -401,7 +403,10 @@ impl Board {
             job.estimates.clear();
             self.metrics.ended(State::Cancelled.name());
             Ok(())
-        })
+        })?;
+        // Nobody reads these photos any more, unless someone is at it: then what comes of it is not looked at.
+        unread.iter().for_each(|folder| clear(folder));
+        Ok(())
     }
 
     /// Forgets a job, and what lies on disk of it.
