@@ -178,7 +178,7 @@ mod tests {
     use glam::{Vec2, Vec4};
 
     use super::*;
-    use crate::{GeneratorConfig, generate};
+    use freerange_generate::{GeneratorConfig, generate};
 
     /// A tetrahedron of four separate faces.
     fn tetrahedron() -> Mesh {

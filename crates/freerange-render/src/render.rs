@@ -251,7 +251,8 @@ fn window(scene: &Scene, camera: &Camera) -> [u32; 4] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{GeneratorConfig, Lighting, generate};
+    use crate::Lighting;
+    use freerange_generate::{GeneratorConfig, generate};
 
     #[test]
     fn the_table_of_codes_is_exact() {

@@ -3,6 +3,8 @@
 //! `cargo run --release -p freerange-scene --example contradictions -- FIRST_SEED SCENES [FOLDER [KINDS]]`: photos are written into
 //! FOLDER; KINDS are some of right, mixed, shifted, swapped, turned30.
 
+use std::f64::consts::TAU;
+
 use freerange_camera::View;
 use freerange_scene::estimate::{Compared, Hints, contradictions, overlap, unjudged};
 use glam::{DMat4, DQuat, DVec3};
@@ -33,7 +35,7 @@ fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let number = |i: usize| arguments[i].parse::<u64>().expect("a number");
     for seed in number(0)..number(0) + number(1) {
-        let (count, turn) = [(8, 6.28), (8, 6.28), (5, 6.28), (12, 6.28), (8, 2.5), (6, 4.0)][(seed % 6) as usize];
+        let (count, turn) = [(8, TAU), (8, TAU), (5, TAU), (12, TAU), (8, 2.5), (6, 4.0)][(seed % 6) as usize];
         let scene = tabletop::tabletop(seed, count, turn, (320, 240));
         if let Some(folder) = arguments.get(2) {
             for v in scene.views.iter().take(2) {

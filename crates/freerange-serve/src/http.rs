@@ -208,13 +208,16 @@ struct Head {
     early: Vec<u8>,
 }
 
+/// What writes to a client as long as it wants to.
+type Writes = dyn FnOnce(&mut TcpStream) -> io::Result<()> + Send;
+
 /// What an answer holds.
 pub enum Content {
     Bytes(Vec<u8>),
     Text(&'static str),
     File(File, u64),
     /// Written as it comes, until it ends or the client has gone.
-    Stream(Box<dyn FnOnce(&mut TcpStream) -> io::Result<()> + Send>),
+    Stream(Box<Writes>),
 }
 
 /// An answer.

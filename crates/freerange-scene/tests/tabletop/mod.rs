@@ -1,7 +1,11 @@
 //! Photos of generated objects on tables: what estimates of masks are tuned on. The scenes of the shared folder only confirm.
 
+#![allow(dead_code)] // tests and examples take different parts
+
 use freerange_camera::{Camera, View};
-use freerange_mesh::{GeneratorConfig, Lighting, LightingConfig, Mesh, Scene, generate, linear_to_srgb, render};
+use freerange_generate::{GeneratorConfig, generate, kind_of};
+use freerange_mesh::{Mesh, linear_to_srgb};
+use freerange_render::{Lighting, LightingConfig, Scene, render};
 use glam::{DVec3, Vec3};
 use image::{Rgba, RgbaImage};
 use rand::{Rng, SeedableRng};
@@ -110,7 +114,7 @@ pub fn tabletop(seed: u64, count: usize, turn: f64, size: (u32, u32)) -> Tableto
     let config = GeneratorConfig::default();
     let mesh = generate(seed, &config).unwrap();
     let cloth = [Cloth::Wood, Cloth::Checks, Cloth::Speckles, Cloth::Plain, Cloth::Print][rng.random_range(0..5)];
-    let kind = freerange_mesh::kind_of(seed, &config).unwrap();
+    let kind = kind_of(seed, &config).unwrap();
     let mut colour = || {
         let value: f32 = rng.random_range(0.08..0.7);
         value * Vec3::new(rng.random_range(0.6..1.0), rng.random_range(0.6..1.0), rng.random_range(0.4..1.0))
