@@ -34,6 +34,9 @@ pub const EXAMPLE: Example = Example {
     files: files!["transforms_train.json", "train/000.png", "train/001.png", "train/002.png", "train/003.png"],
 };
 
+/// Names of a job's views, which of them it was shown, and its options.
+pub type Seen = (Vec<String>, Vec<usize>, JobOptions);
+
 /// Moves a cloud step by step to where the first camera looks from.
 #[derive(Default)]
 pub struct Fake {
@@ -41,7 +44,7 @@ pub struct Fake {
     pub pause: Duration,
     pub steps: usize,
     /// What runs were given: views' names, share of alpha, options.
-    pub seen: Mutex<Vec<(Vec<String>, Vec<usize>, JobOptions)>>,
+    pub seen: Mutex<Vec<Seen>>,
     pub running: AtomicUsize,
     pub most_at_once: AtomicUsize,
     pub panics: bool,
