@@ -55,8 +55,8 @@ pub struct Evidence {
 /// Share of the masks outside of the others' hull above which poses are doubted, alone and of what it is where photos are handed round. On
 /// generated scenes: up to 0.02 and 0.04 of it with right poses; with mixed ones from 0.16 and 0.45, with two photos exchanged from 0.08
 /// and 0.24.
-const OUTSIDE: f64 = 0.05;
-const OF_OTHERS: f64 = 0.12;
+const OUTSIDE: f64 = 0.06;
+const OF_OTHERS: f64 = 0.2;
 /// A table that differs so much where photos are handed round (Lab) tells right poses from wrong ones: on it right ones have at most 0.15 of
 /// that, mixed ones 0.7 and more.
 const TELLING: f64 = 2.5;
