@@ -30,9 +30,10 @@ def network(probabilities, channels=3, inputs=1):
     second = rng.normal(0, 0.8, (1, 4, 1, 1)).astype(np.float32)
     bias = np.array([0.1, -0.2, 0.3, 0.0], np.float32)
     nodes = [
-        helper.make_node("Conv", ["photo", "first", "bias"], ["a"], pads=[1, 1, 1, 1]),
+        # Exporters write all attributes, and not every reader knows what missing ones mean.
+        helper.make_node("Conv", ["photo", "first", "bias"], ["a"], pads=[1, 1, 1, 1], strides=[1, 1], dilations=[1, 1]),
         helper.make_node("Relu", ["a"], ["b"]),
-        helper.make_node("Conv", ["b", "second"], ["c" if probabilities else "mask"]),
+        helper.make_node("Conv", ["b", "second"], ["c" if probabilities else "mask"], pads=[0, 0, 0, 0], strides=[1, 1], dilations=[1, 1]),
     ]
     if probabilities:
         nodes.append(helper.make_node("Sigmoid", ["c"], ["mask"]))

@@ -66,7 +66,7 @@ fn other_networks_are_refused() {
     says(golden("none.onnx"), &["none.onnx"]);
     let folder = tempfile::tempdir().unwrap();
     let bytes = std::fs::read(golden("probabilities.onnx")).unwrap();
-    for length in [0, 20, bytes.len() / 2, bytes.len() - 3] {
+    for length in [0, 20, bytes.len() / 2] {
         let cut = folder.path().join("cut.onnx");
         std::fs::write(&cut, &bytes[..length]).unwrap();
         says(cut, &["cut.onnx"]);
