@@ -308,7 +308,8 @@ fn evaluation(views: &[View], config: &BuildConfig, seed: u64) -> Result<Option<
 #[derive(serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 enum Outcome {
-    Made { split: Split, psnr: Option<f64>, flagged: bool, statistics: BTreeMap<u32, Statistics> },
+    #[serde(rename = "made")]
+    Built { split: Split, psnr: Option<f64>, flagged: bool, statistics: BTreeMap<u32, Statistics> },
     Failed { reason: String },
 }
 
@@ -455,7 +456,7 @@ where
             let object = ObjectBytes::new(bytes.clone(), id, self.store.path(&name))?.object(&self.config.depths)?;
             let statistics = statistics_of(&object, &self.config.depths)?;
             self.store.write(&format!("{folder}/{}", bytes_name(index)), &bytes)?;
-            self.write_outcome(&folder, index, &Outcome::Made { split, psnr, flagged, statistics })?;
+            self.write_outcome(&folder, index, &Outcome::Built { split, psnr, flagged, statistics })?;
         }
         Ok(())
     }
@@ -539,7 +540,7 @@ where
         let bytes = bytes.map_err(|e| chain(&e))?;
         add_elapsed(&mut made.seconds.write, start);
         let psnr = made.psnr.as_ref().map(|p| p.leaves);
-        Ok((bytes, Outcome::Made { split: metadata.split, psnr, flagged, statistics }, made.psnr, made.seconds))
+        Ok((bytes, Outcome::Built { split: metadata.split, psnr, flagged, statistics }, made.psnr, made.seconds))
     }
 
     fn write_outcome(&self, folder: &str, index: u64, outcome: &Outcome) -> Result<(), BuildError> {
@@ -573,7 +574,7 @@ where
             let Item { id, licence, .. } = self.item(index)?;
             match self.outcome(&folder, index)?.ok_or_else(|| lost(format!("{folder}/{}", outcome_name(index))))? {
                 Outcome::Failed { reason } => record.failures.push(Failure { index, id, reason }),
-                Outcome::Made { split, psnr, flagged, statistics } => {
+                Outcome::Built { split, psnr, flagged, statistics } => {
                     let part = format!("{folder}/{}", bytes_name(index));
                     let content = self.store.read(&part, MAX_PART)?.ok_or_else(|| lost(part))?;
                     file.write_all(&content).map_err(IoError::at(&self.store.path(&name)))?;

@@ -18,7 +18,7 @@ const START_SPREAD: f32 = 0.8;
 /// of the opacity `fit.initial_opacity`: faint enough that what is behind them is seen and learns.
 pub(crate) fn fitted_gaussians(photographed: &mut Photographed, config: &ObjectConfig) -> Result<Cloud, BuildError> {
     let start = SurfaceConfig {
-        points: config.fit.initial.min(config.fit.max_gaussians),
+        points: config.fit.initial.min(config.fit.cap_max),
         spread: START_SPREAD,
         opacity: config.fit.initial_opacity as f32,
         ..config.surface.clone()
@@ -47,7 +47,7 @@ pub(crate) fn adapted(
     }
     let config = FitConfig {
         iterations: steps,
-        max_gaussians: slice.len(),
+        cap_max: slice.len(),
         initial: slice.len(),
         growth_start: usize::MAX,
         noise: 0.0,
@@ -82,7 +82,7 @@ mod tests {
         let mut config = tiny_config();
         config.views = 12;
         config.cameras.resolution = 64;
-        config.fit = FitConfig { iterations: 60, initial: 512, max_gaussians: 512, ..FitConfig::default() };
+        config.fit = FitConfig { iterations: 60, initial: 512, cap_max: 512, ..FitConfig::default() };
         let mesh = freerange_generate::generate(3, &config.generator).unwrap();
         let mut photographed = Photographed::new(mesh, 3, &config, 4, &mut Seconds::default()).unwrap();
         let leaves = fitted_gaussians(&mut photographed, &config).unwrap();

@@ -59,9 +59,9 @@ pub struct CountQuality {
 /// [`BuildError::Config`] for counts that are no powers of two or exceed the full fit's; what making an object may say.
 pub fn measure_quality(item: &Item, config: &BuildConfig, counts: &[usize]) -> Result<Quality, BuildError> {
     config.validate()?;
-    let most = config.object.fit.max_gaussians;
+    let most = config.object.fit.cap_max;
     let fine = |n: &usize| n.is_power_of_two() && *n <= most;
-    check(counts.iter().all(fine), "counts", &format!("powers of two up to fit.max_gaussians = {most}"), counts)?;
+    check(counts.iter().all(fine), "counts", &format!("powers of two up to fit.cap_max = {most}"), counts)?;
     check(config.shard.held_out > 0, "held_out", "at least 1 to measure", config.shard.held_out)?;
     let (mesh, _) = mesh_of(item, config)?;
     let seed = seed_of(item, config);
@@ -85,7 +85,7 @@ pub fn measure_quality(item: &Item, config: &BuildConfig, counts: &[usize]) -> R
     let surface = LodTree::build_to_depth(&surface, deepest, object.alignment)?;
     let by_count = counts.iter().map(|&gaussians| {
         let fit =
-            FitConfig { max_gaussians: gaussians, initial: object.fit.initial.min(gaussians), ..object.fit.clone() };
+            FitConfig { cap_max: gaussians, initial: object.fit.initial.min(gaussians), ..object.fit.clone() };
         let (_, fit, fit_seconds) = timed(&mut photographed, fit)?;
         let slice = tree.slice(gaussians.ilog2())?;
         let polished = match object.polish {
@@ -148,7 +148,7 @@ mod tests {
         config.object.views = 12;
         config.object.fit.iterations = 100;
         config.object.fit.initial = 1024;
-        config.object.fit.max_gaussians = 1024;
+        config.object.fit.cap_max = 1024;
         config.object.polish = 20;
         let folder = tempfile::tempdir().unwrap();
         write_ball(&folder.path().join("ball.ply"));

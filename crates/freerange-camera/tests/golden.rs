@@ -2,28 +2,16 @@
 
 use freerange_camera::{Camera, PatchLayout, SelectionConfig, k_means, plucker, select_views};
 use glam::{DMat4, DVec3};
+use freerange_vectors::{Vectors, json};
 use rand::SeedableRng;
-use safetensors::SafeTensors;
-
-const GOLDEN: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden");
-
-fn json(path: &str) -> serde_json::Value {
-    serde_json::from_slice(&std::fs::read(format!("{GOLDEN}/{path}")).unwrap()).unwrap()
-}
 
 #[test]
 fn plucker_coordinates() {
     for case in 0..3 {
-        let bytes = std::fs::read(format!("{GOLDEN}/flow/plucker{case}.safetensors")).unwrap();
-        let file = SafeTensors::deserialize(&bytes).unwrap();
-        let floats = |name: &str| -> Vec<f32> {
-            let data = file.tensor(name).unwrap();
-            data.data().chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect()
-        };
+        let file = Vectors::read(&format!("flow/plucker{case}.safetensors"));
         let meta = &json(&format!("flow/plucker{case}.json"))["meta"];
         let number = |name: &str| meta[name].as_u64().unwrap();
-        let matrix: Vec<f64> = floats("in/viewmat").iter().map(|v| f64::from(*v)).collect();
-        let k: Vec<f64> = floats("in/K").iter().map(|v| f64::from(*v)).collect();
+        let (matrix, k) = (file.doubles("in/viewmat"), file.doubles("in/K"));
         let camera = Camera {
             width: number("W") as u32,
             height: number("H") as u32,
@@ -37,15 +25,15 @@ fn plucker_coordinates() {
             ("out/plucker_conv", PatchLayout::Stride(number("patch") as u32)),
             ("out/plucker_scaled", PatchLayout::Scaled),
         ] {
-            let expected = floats(name);
+            let expected = file.floats(name);
             let found = plucker(&camera, number("w") as usize, number("h") as usize, layout);
             assert_eq!(found.len(), expected.len());
-            for (f, e) in found.iter().zip(&expected) {
+            for (f, e) in found.iter().zip(expected) {
                 assert!((f - e).abs() < 2e-6, "{case} {name}: {f} {e}");
             }
         }
-        for (f, e) in camera.center().to_array().iter().zip(floats("out/origin")) {
-            assert!((f - f64::from(e)).abs() < 2e-6);
+        for (f, e) in camera.center().to_array().iter().zip(file.floats("out/origin")) {
+            assert!((f - f64::from(*e)).abs() < 2e-6);
         }
     }
 }

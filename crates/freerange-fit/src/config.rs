@@ -28,8 +28,9 @@ pub struct FitConfig {
     /// Optimisation steps.
     pub iterations: usize,
     /// Number of Gaussians never exceeded, and reached if there are enough growth steps.
-    pub max_gaussians: usize,
-    /// Number of Gaussians to start with, where no cloud is given; at most `max_gaussians`.
+    #[serde(alias = "max_gaussians")]
+    pub cap_max: usize,
+    /// Number of Gaussians to start with, where no cloud is given; at most `cap_max`.
     pub initial: usize,
     /// Opacity of these, 0..1. (The data engine's fits, which start from points on a surface, take it, too.)
     pub initial_opacity: f64,
@@ -38,7 +39,8 @@ pub struct FitConfig {
     /// Radius of the sphere around the origin that holds the object. World units.
     pub radius: f64,
     /// Steps between two rounds of relocation and growth.
-    pub growth_interval: usize,
+    #[serde(alias = "growth_interval")]
+    pub refine_every: usize,
     /// First step with such a round.
     pub growth_start: usize,
     /// Fraction of the iterations after which there are no more such rounds, 0..1.
@@ -56,7 +58,8 @@ pub struct FitConfig {
     /// Weight of the mean standard deviation in the loss.
     pub scale_regularizer: f64,
     /// Strength of the noise that moves faint Gaussians, as a multiple of the centres' current learning rate.
-    pub noise: f64,
+    #[serde(alias = "noise")]
+    pub noise_lr: f64,
     /// Gaussians of at most this opacity are dead, and put where others are. 0..1
     pub dead_opacity: f64,
     /// What the Gaussians are rendered in front of.
@@ -74,12 +77,12 @@ impl Default for FitConfig {
     fn default() -> Self {
         Self {
             iterations: 3000,
-            max_gaussians: 4096,
+            cap_max: 4096,
             initial: 2048,
             initial_opacity: 0.5,
             initial_scale: 0.5,
             radius: 0.5,
-            growth_interval: 100,
+            refine_every: 100,
             growth_start: 500,
             growth_stop: 5.0 / 6.0,
             growth: 1.05,
@@ -91,7 +94,7 @@ impl Default for FitConfig {
             lambda_ssim: 0.2,
             opacity_regularizer: 0.01,
             scale_regularizer: 0.01,
-            noise: 5e5,
+            noise_lr: 5e5,
             dead_opacity: 0.005,
             background: Background::Random,
             views_per_step: 1,
@@ -213,15 +216,15 @@ impl FitConfig {
     /// Refuses values that no fit can work with.
     pub fn check(&self) -> Result<(), FitError> {
         at_least_one("iterations", self.iterations)?;
-        let most = self.max_gaussians;
-        check("max_gaussians", "1 to 16777216", most, (1..=MAX_GAUSSIANS).contains(&most))?;
-        check("initial", "1 to max_gaussians", self.initial, (1..=most).contains(&self.initial))?;
+        let most = self.cap_max;
+        check("cap_max", "1 to 16777216", most, (1..=MAX_GAUSSIANS).contains(&most))?;
+        check("initial", "1 to cap_max", self.initial, (1..=most).contains(&self.initial))?;
         let strict = |v: f64| v > 0.0 && v < 1.0;
         check("initial_opacity", "between 0 and 1", self.initial_opacity, strict(self.initial_opacity))?;
         check("dead_opacity", "between 0 and 1", self.dead_opacity, strict(self.dead_opacity))?;
         positive("initial_scale", self.initial_scale)?;
         positive("radius", self.radius)?;
-        at_least_one("growth_interval", self.growth_interval)?;
+        at_least_one("refine_every", self.refine_every)?;
         fraction("growth_stop", self.growth_stop)?;
         check("growth", "a finite number, at least 1", self.growth, self.growth >= 1.0 && self.growth.is_finite())?;
         self.rates.check()?;
@@ -230,7 +233,7 @@ impl FitConfig {
         fraction("lambda_ssim", self.lambda_ssim)?;
         finite_not_negative("opacity_regularizer", self.opacity_regularizer)?;
         finite_not_negative("scale_regularizer", self.scale_regularizer)?;
-        finite_not_negative("noise", self.noise)?;
+        finite_not_negative("noise_lr", self.noise_lr)?;
         at_least_one("views_per_step", self.views_per_step)?;
         check_render_size(self.render_size)
     }
@@ -262,9 +265,9 @@ impl RefineConfig {
         let rounds = ((last / interval as f64).ceil() as i32 - 1).max(1);
         FitConfig {
             iterations: self.steps,
-            max_gaussians: most,
+            cap_max: most,
             initial: start,
-            growth_interval: interval,
+            refine_every: interval,
             growth_start: if self.growth_rounds == 0 { usize::MAX } else { interval },
             growth_stop: GROWTH_STOP,
             // One Gaussian more, since rounds round down.
@@ -317,9 +320,9 @@ mod tests {
             assert!(message.starts_with(field), "{message}");
         };
         refused(&|c| c.iterations = 0, "iterations");
-        refused(&|c| c.max_gaussians = usize::MAX, "max_gaussians");
-        refused(&|c| c.initial = c.max_gaussians + 1, "initial");
-        refused(&|c| c.noise = f64::NAN, "noise");
+        refused(&|c| c.cap_max = usize::MAX, "cap_max");
+        refused(&|c| c.initial = c.cap_max + 1, "initial");
+        refused(&|c| c.noise_lr = f64::NAN, "noise_lr");
         refused(&|c| c.growth = 0.9, "growth");
         refused(&|c| c.lambda_ssim = 1.1, "lambda_ssim");
         refused(&|c| c.rates.color = f64::INFINITY, "rates.color");
@@ -351,7 +354,7 @@ mod tests {
             fit.check().unwrap();
             let due = |step: &usize| {
                 *step >= fit.growth_start
-                    && step.is_multiple_of(fit.growth_interval)
+                    && step.is_multiple_of(fit.refine_every)
                     && (*step as f64) < fit.growth_stop * steps as f64
             };
             let rounds = (0..steps).filter(due).count();

@@ -22,7 +22,7 @@ use std::ops::ControlFlow;
 ///
 /// # Errors
 /// If there are no views, or they differ in size from their camera; if the configuration is impossible,
-/// `initial` is empty, not finite or larger than `max_gaussians`; or if the optimisation diverges.
+/// `initial` is empty, not finite or larger than `cap_max`; or if the optimisation diverges.
 pub fn fit(
     views: &[View],
     initial: Option<&Cloud>,
@@ -33,7 +33,7 @@ pub fn fit(
     let targets = Targets::new(views, config.render_size)?;
     let mut rng = ChaCha8Rng::seed_from_u64(config.seed);
     let cloud = match initial {
-        Some(cloud) => checked(cloud, config.max_gaussians)?,
+        Some(cloud) => checked(cloud, config.cap_max)?,
         None => random_cloud(&targets, config, &mut rng),
     };
     optimise(cloud, &targets, config, &mut rng, |_, _, _| Ok(()), progress)
@@ -65,11 +65,11 @@ pub(crate) fn optimise(
         adam.step(cloud.rows_mut(), &objective.gradients, &config.rates.by_channel(mean_rate));
         normalize_rotations(&mut cloud);
 
-        let due = step >= config.growth_start && step % config.growth_interval == 0;
+        let due = step >= config.growth_start && step % config.refine_every == 0;
         if due && done < config.growth_stop {
             relocate_and_grow(&mut cloud, &mut adam, config, rng);
         }
-        add_noise(&mut cloud, config.noise * mean_rate, config.dead_opacity, rng);
+        add_noise(&mut cloud, config.noise_lr * mean_rate, config.dead_opacity, rng);
         check_cloud(&cloud, step)?;
 
         let (step, steps, gaussians) = (step + 1, config.iterations, cloud.len());
@@ -89,7 +89,7 @@ pub(crate) fn checked(cloud: &Cloud, most: usize) -> Result<Cloud, FitError> {
     cloud.check_finite()?;
     if cloud.len() > most {
         let expected = format!("at least the {} Gaussians to start from", cloud.len());
-        return Err(FitError::Config { field: "max_gaussians", expected, found: most.to_string() });
+        return Err(FitError::Config { field: "cap_max", expected, found: most.to_string() });
     }
     let mut cloud = cloud.clone();
     cloud.canonicalize_rotations();

@@ -35,7 +35,7 @@ pub(crate) fn relocation(opacity: f64, copies: usize) -> (f64, f64) {
 pub(crate) fn grown(count: usize, config: &FitConfig) -> usize {
     // Few Gaussians would never grow by rounding down alone.
     let by_one = count + usize::from(config.growth > 1.0);
-    by_one.max((count as f64 * config.growth) as usize).min(config.max_gaussians).max(count)
+    by_one.max((count as f64 * config.growth) as usize).min(config.cap_max).max(count)
 }
 
 /// Moves dead Gaussians to live ones, then adds new ones, both drawn in proportion to opacity.
@@ -116,12 +116,12 @@ impl Rows for Cloud {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::tests::golden;
+    use freerange_vectors::Vectors;
     use rand_chacha::rand_core::SeedableRng;
 
     #[test]
     fn relocation_matches_the_vectors() {
-        let file = golden("mcmc/relocation");
+        let file = Vectors::read("mcmc/relocation.safetensors");
         let (opacity, scales, counts) = (file.floats("in/opacity"), file.floats("in/scales"), file.ints("in/n"));
         let (expected_o, expected_s) = (file.floats("out/opacity_ubc"), file.floats("out/scales_ubc"));
         assert!(counts.len() * opacity.len() == expected_o.len() && !expected_o.is_empty());
@@ -157,7 +157,7 @@ mod tests {
 
     #[test]
     fn noise_matches_the_vectors() {
-        let file = golden("mcmc/noise");
+        let file = Vectors::read("mcmc/noise.safetensors");
         let (quats, scales) = (file.floats("in/quats"), file.floats("in/log_scales"));
         let (logits, xi, expected) =
             (file.floats("in/logit_opacities"), file.floats("in/xi"), file.floats("out/delta_means"));
@@ -198,7 +198,7 @@ mod tests {
 
     #[test]
     fn growth_reaches_the_limit_and_stays() {
-        let config = FitConfig { max_gaussians: 1000, ..Default::default() };
+        let config = FitConfig { cap_max: 1000, ..Default::default() };
         let mut counts = vec![7];
         while counts.len() < 120 {
             counts.push(grown(counts[counts.len() - 1], &config));
@@ -223,7 +223,7 @@ mod tests {
     fn the_dead_join_the_living() {
         let mut cloud = example(&[2.0, -9.0, 0.0, -7.0, -9.0]);
         let (mut adam, mut rng) = (Adam::default(), ChaCha8Rng::seed_from_u64(5));
-        let config = FitConfig { max_gaussians: 5, initial: 5, ..Default::default() };
+        let config = FitConfig { cap_max: 5, initial: 5, ..Default::default() };
         relocate_and_grow(&mut cloud, &mut adam, &config, &mut rng);
         assert_eq!(cloud.len(), 5);
         let mut kept = 1.0;

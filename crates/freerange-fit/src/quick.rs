@@ -37,11 +37,11 @@ impl QuickFitConfig {
     fn config(&self, seed: u64) -> FitConfig {
         FitConfig {
             iterations: self.iterations,
-            max_gaussians: self.gaussians,
+            cap_max: self.gaussians,
             initial: self.gaussians,
             // Relocation alone: the number does not grow.
             growth_start: 50,
-            growth_interval: 50,
+            refine_every: 50,
             growth: 1.0,
             render_size: Some(self.render_size),
             seed,

@@ -7,31 +7,7 @@ use freerange_splat::{Cloud, channel};
 use glam::DVec3;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use safetensors::SafeTensors;
 use std::ops::ControlFlow;
-
-/// A committed reference file.
-pub(crate) struct Golden(Vec<u8>);
-
-pub(crate) fn golden(name: &str) -> Golden {
-    let path = format!("{}/../../tests/golden/{name}.safetensors", env!("CARGO_MANIFEST_DIR"));
-    Golden(std::fs::read(path).unwrap())
-}
-
-impl Golden {
-    fn words(&self, name: &str) -> Vec<[u8; 4]> {
-        let file = SafeTensors::deserialize(&self.0).unwrap();
-        file.tensor(name).unwrap().data().as_chunks().0.to_vec()
-    }
-
-    pub fn floats(&self, name: &str) -> Vec<f32> {
-        self.words(name).into_iter().map(f32::from_le_bytes).collect()
-    }
-
-    pub fn ints(&self, name: &str) -> Vec<i32> {
-        self.words(name).into_iter().map(i32::from_le_bytes).collect()
-    }
-}
 
 /// `n` opaque, coloured Gaussians in a ball of radius 0.4.
 pub(crate) fn ball(n: usize, seed: u64) -> Cloud {
@@ -102,10 +78,10 @@ fn go(_: &FitProgress<'_>) -> ControlFlow<()> {
 fn small() -> FitConfig {
     FitConfig {
         iterations: 800,
-        max_gaussians: 200,
+        cap_max: 200,
         initial: 100,
         growth_start: 100,
-        growth_interval: 50,
+        refine_every: 50,
         growth: 1.1,
         ..Default::default()
     }
@@ -312,14 +288,14 @@ fn bad_input_is_refused() {
         }
     }
     let large = ball(20, 1);
-    let tight = FitConfig { max_gaussians: 10, initial: 10, ..Default::default() };
+    let tight = FitConfig { cap_max: 10, initial: 10, ..Default::default() };
     assert!(fit(&views, Some(&large), &tight, go).unwrap_err().to_string().contains("20 Gaussians"));
 }
 
 #[test]
 fn divergence_is_an_error() {
     let views = ring(2, 16, &ball(5, 1));
-    let config = FitConfig { iterations: 50, noise: 1e300, ..small() };
+    let config = FitConfig { iterations: 50, noise_lr: 1e300, ..small() };
     let message = fit(&views, None, &config, go).unwrap_err().to_string();
     assert!(message.contains("not finite") && message.starts_with("step"), "{message}");
 }

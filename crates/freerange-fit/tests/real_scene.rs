@@ -33,7 +33,7 @@ fn psnr(cloud: &Cloud, views: &[View]) -> f64 {
 #[ignore = "needs FREERANGE_SHARED"]
 fn a_real_object_is_fitted_and_refined() {
     let (around, others) = (views("transforms_val.json", 128), views("transforms_full.json", 128));
-    let config = FitConfig { iterations: 2000, max_gaussians: 2048, initial: 1024, ..Default::default() };
+    let config = FitConfig { iterations: 2000, cap_max: 2048, initial: 1024, ..Default::default() };
     let start = Instant::now();
     let fitted = fit(&around, None, &config, |_| ControlFlow::Continue(())).unwrap();
     let (seen, unseen) = (psnr(&fitted, &around), psnr(&fitted, &others));

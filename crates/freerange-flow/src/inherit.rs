@@ -60,7 +60,10 @@ pub(crate) fn load(path: &Path) -> Result<Table, FlowError> {
 }
 
 /// Former names of fields: the tables they lie in, the name of then, that of now.
-const RENAMED: [(&[&str], &str, &str); 3] = [
+const RENAMED: [(&[&str], &str, &str); 6] = [
+    (&["data", "object", "fit"], "max_gaussians", "cap_max"),
+    (&["data", "object", "fit"], "growth_interval", "refine_every"),
+    (&["data", "object", "fit"], "noise", "noise_lr"),
     (&["sample"], "guidance", "cfg_scale"),
     (&["sample"], "photometric", "lambda_pg"),
     (&["sample", "from_noise"], "photometric", "lambda_pg"),

@@ -1,6 +1,6 @@
 //! The path, the loss, the schedule and the solver against independent reference vectors.
 
-use std::{collections::HashMap, path::PathBuf};
+use std::path::PathBuf;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use freerange_flow::{
@@ -8,32 +8,14 @@ use freerange_flow::{
     sample::{SampleConfig, Solver, classifier_free, integrate},
 };
 use freerange_splat::{Cloud, Normalization};
-
-type Vectors = HashMap<String, (Vec<usize>, Vec<f32>)>;
+use freerange_vectors::{Vectors, assert_close, json};
 
 fn load(name: &str) -> Vectors {
-    let path = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/flow")).join(name);
-    let bytes = std::fs::read(&path).unwrap();
-    let file = safetensors::SafeTensors::deserialize(&bytes).unwrap();
-    let floats = file.iter().filter(|(_, view)| view.dtype() == safetensors::Dtype::F32);
-    floats
-        .map(|(name, view)| {
-            let values = view.data().as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
-            (name.to_owned(), (view.shape().to_vec(), values))
-        })
-        .collect()
+    Vectors::read(&format!("flow/{name}"))
 }
 
 fn tensor<const D: usize>(vectors: &Vectors, name: &str, device: &Device) -> Tensor<D> {
-    let (shape, values) = &vectors[name];
-    Tensor::from_data(TensorData::new(values.clone(), shape.clone()), device)
-}
-
-fn assert_close(found: &[f32], expected: &[f32], relative: f32, what: &str) {
-    assert_eq!(found.len(), expected.len(), "{what}");
-    let scale = expected.iter().fold(1e-12f32, |m, x| m.max(x.abs()));
-    let worst = found.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-    assert!(worst <= relative * scale, "{what}: off by {worst} at a scale of {scale}");
+    Tensor::from_data(TensorData::new(vectors.floats(name).to_vec(), vectors.shape(name).to_vec()), device)
 }
 
 fn values<const D: usize>(t: Tensor<D>) -> Vec<f32> {
@@ -46,21 +28,21 @@ fn path_loss_and_its_gradient() {
     let v = load("fm.safetensors");
     let t = tensor::<1>(&v, "in/t", &device);
     let (z1, eps) = (tensor::<3>(&v, "in/z1", &device), tensor::<3>(&v, "in/eps", &device));
-    assert_close(&values(interpolate(eps, z1.clone(), t.clone())), &v["out/zt"].1, 1e-6, "z_t");
+    assert_close("z_t", &values(interpolate(eps, z1.clone(), t.clone())), v.floats("out/zt"), 1e-6);
 
-    let weights: Vec<f32> = v["in/t"].1.iter().map(|&t| render_weight(t)).collect();
-    assert_close(&weights, &v["out/w"].1, 1e-6, "w(t)");
+    let weights: Vec<f32> = v.floats("in/t").iter().map(|&t| render_weight(t)).collect();
+    assert_close("w(t)", &weights, v.floats("out/w"), 1e-6);
 
     // The reference has no bound on 1 - t.
     let estimate = tensor::<3>(&v, "in/zhat1", &device).autodiff().require_grad();
     let loss = flow_loss(estimate.clone(), z1, t, 0.0);
-    let expected = &v["out/fm_per_sample_mean"].1;
+    let expected = v.floats("out/fm_per_sample_mean");
     for (i, (found, expected)) in values(loss.clone().inner()).iter().zip(expected).enumerate() {
         assert!((found - expected).abs() <= 1e-4 * expected, "sample {i}: {found}, expected {expected}");
     }
     let gradients = loss.mean().backward();
     let gradient = values(estimate.grad(&gradients).unwrap());
-    assert_close(&gradient, &v["grad/zhat1_of_fm_mean"].1, 1e-4, "gradient of the flow loss");
+    assert_close("gradient of the flow loss", &gradient, v.floats("grad/zhat1_of_fm_mean"), 1e-4);
 }
 
 #[test]
@@ -77,21 +59,21 @@ fn the_bound_on_the_denominator_only_acts_near_the_data() {
 #[test]
 fn normalisation() {
     let v = load("fm.safetensors");
-    let row = |name: &str| v[name].1.clone().try_into().unwrap();
+    let row = |name: &str| v.floats(name).to_vec().try_into().unwrap();
     let normalization = Normalization::new(row("in/mean"), row("in/std")).unwrap();
-    let z1 = &v["in/z1"].1;
-    let found = normalization.normalize(&Cloud::from_rows(z1.clone()));
-    assert_close(&found, &v["out/z1_normalised"].1, 1e-5, "normalised");
-    assert_close(normalization.denormalize(z1).rows(), &v["out/z1_denormalised"].1, 1e-5, "denormalised");
+    let z1 = v.floats("in/z1");
+    let found = normalization.normalize(&Cloud::from_rows(z1.to_vec()));
+    assert_close("normalised", &found, v.floats("out/z1_normalised"), 1e-5);
+    assert_close("denormalised", normalization.denormalize(z1).rows(), v.floats("out/z1_denormalised"), 1e-5);
 }
 
 #[test]
 fn cosine_schedule_is_the_snr_matched_one() {
     let v = load("cosine_schedule.safetensors");
-    let u = &v["in/u"].1;
+    let u = v.floats("in/u");
     // The reference draws u from clean (0) to noise (1); ours rises with t.
     let found: Vec<f32> = u.iter().map(|&u| cosine_time(1.0 - u)).collect();
-    assert_close(&found, &v["out/t_A0_cosmap"].1, 1e-5, "t");
+    assert_close("t", &found, v.floats("out/t_A0_cosmap"), 1e-5);
     assert_eq!(cosine_time(0.0), 0.0);
     assert!((cosine_time(1.0) - 1.0).abs() < 1e-6);
 }
@@ -131,16 +113,11 @@ fn euler_with_both_guidances_on_the_toy_model() {
             },
         )
         .unwrap();
-        let expected = &v["out/trajectory"].1;
-        assert_close(&trajectory, &expected[..trajectory.len()], 1e-4, &format!("{name}: trajectory"));
-        assert_close(&estimates, &v["out/zhat_guided"].1, 1e-4, &format!("{name}: estimates"));
+        let expected = v.floats("out/trajectory");
+        assert_close(&format!("{name}: trajectory"), &trajectory, &expected[..trajectory.len()], 1e-4);
+        assert_close(&format!("{name}: estimates"), &estimates, v.floats("out/zhat_guided"), 1e-4);
         let rows = values(last).len();
-        assert_close(
-            &estimates[estimates.len() - rows..],
-            &v["out/zhat_guided"].1[estimates.len() - rows..],
-            1e-4,
-            "last",
-        );
+        assert_close("last", &estimates[estimates.len() - rows..], v.floats("out/zhat_guided")[estimates.len() - rows..], 1e-4);
     }
 }
 
@@ -148,9 +125,7 @@ fn euler_with_both_guidances_on_the_toy_model() {
 fn toy_cases() -> Vec<(String, usize, f32, f32, f32)> {
     (0..2)
         .map(|i| {
-            let path = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/flow"));
-            let text = std::fs::read_to_string(path.join(format!("sampler{i}.json"))).unwrap();
-            let meta = serde_json::from_str::<serde_json::Value>(&text).unwrap()["meta"].clone();
+            let meta = json(&format!("flow/sampler{i}.json"))["meta"].clone();
             let number = |name: &str| meta[name].as_f64().unwrap() as f32;
             (format!("sampler{i}.safetensors"), number("steps") as usize, number("s"), number("lam"), number("kappa"))
         })

@@ -2,16 +2,13 @@
 
 mod common;
 
-use std::path::PathBuf;
-
 use common::difference;
 use freerange_formats::{Frame, Loaded, read};
 use freerange_splat::Cloud;
 use glam::{DQuat, DVec3};
 
 fn golden(name: &str, frame: Frame) -> Loaded {
-    let folder = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/formats"));
-    read(&folder.join(name), frame).unwrap()
+    read(&freerange_vectors::path("formats").join(name), frame).unwrap()
 }
 
 /// In the order of the source: writers sort.

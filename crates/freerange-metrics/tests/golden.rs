@@ -1,8 +1,7 @@
 //! Against vectors of PyTorch's and scikit-image's own results.
 
 use freerange_metrics::*;
-use safetensors::SafeTensors;
-use std::path::PathBuf;
+use freerange_vectors::{Vectors, json_at};
 
 struct Case {
     name: String,
@@ -10,14 +9,8 @@ struct Case {
     height: usize,
     first: Vec<f32>,
     second: Vec<f32>,
-    tensors: Vec<u8>,
+    tensors: Vectors,
     scalars: serde_json::Value,
-}
-
-fn floats(bytes: &[u8], name: &str) -> Vec<f32> {
-    let file = SafeTensors::deserialize(bytes).unwrap();
-    let view = file.tensor(name).unwrap_or_else(|e| panic!("{name}: {e}"));
-    view.data().chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect()
 }
 
 /// `[3, h, w]` to `[h, w, 3]`.
@@ -27,23 +20,21 @@ fn interleaved(planes: &[f32]) -> Vec<f32> {
 }
 
 fn cases() -> Vec<Case> {
-    let folder = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/metrics"));
     let mut out = Vec::new();
-    for entry in std::fs::read_dir(folder).unwrap() {
+    for entry in std::fs::read_dir(freerange_vectors::path("metrics")).unwrap() {
         let path = entry.unwrap().path();
         let name = path.file_stem().unwrap().to_string_lossy().into_owned();
         if !name.starts_with("img") || path.extension().unwrap() != "safetensors" {
             continue;
         }
-        let json: serde_json::Value =
-            serde_json::from_slice(&std::fs::read(path.with_extension("json")).unwrap()).unwrap();
-        let tensors = std::fs::read(&path).unwrap();
+        let json = json_at(&path.with_extension("json"));
+        let tensors = Vectors::open(&path);
         out.push(Case {
             name,
             width: json["meta"]["W"].as_u64().unwrap() as usize,
             height: json["meta"]["H"].as_u64().unwrap() as usize,
-            first: interleaved(&floats(&tensors, "in/img1")),
-            second: interleaved(&floats(&tensors, "in/img2")),
+            first: interleaved(tensors.floats("in/img1")),
+            second: interleaved(tensors.floats("in/img2")),
             tensors,
             scalars: json["scalars_f64"].clone(),
         });
@@ -86,7 +77,7 @@ fn gradients() {
         let expected = 0.8 * l1(&c.first, &c.second).unwrap() + 0.2 * (1.0 - ssim);
         assert!((loss - expected).abs() < 1e-7);
         for (key, found) in [("grad/ssim_3dgs_img1", ssim_gradient), ("grad/dssim_loss_img1", loss_gradient)] {
-            let expected = interleaved(&floats(&c.tensors, key));
+            let expected = interleaved(c.tensors.floats(key));
             let largest = expected.iter().fold(0.0f32, |m, v| m.max(v.abs()));
             // Where the true gradient is (nearly) zero, what counts is the size of one pixel's share, 1 / n.
             let tolerance = 1e-3 * largest.max(1.0 / expected.len() as f32);

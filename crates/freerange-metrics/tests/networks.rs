@@ -1,27 +1,20 @@
 //! The Frechet distance and the cosine against vectors of numpy's, scipy's and PyTorch's results.
 #![cfg(feature = "networks")]
 
-use std::path::PathBuf;
-
 use freerange_metrics::*;
-use safetensors::SafeTensors;
+use freerange_vectors::{Vectors, json};
 
-fn vectors(name: &str) -> (Vec<u8>, serde_json::Value) {
-    let path = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/metrics")).join(name);
-    let json = std::fs::read(path.with_extension("json")).unwrap();
-    (std::fs::read(path.with_extension("safetensors")).unwrap(), serde_json::from_slice(&json).unwrap())
+fn vectors(name: &str) -> (Vectors, serde_json::Value) {
+    (Vectors::read(&format!("metrics/{name}.safetensors")), json(&format!("metrics/{name}.json")))
 }
 
 /// Rows and their width.
-fn matrix(bytes: &[u8], name: &str) -> (Vec<f32>, usize) {
-    let file = SafeTensors::deserialize(bytes).unwrap();
-    let view = file.tensor(name).unwrap();
-    let values = view.data().as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
-    (values, *view.shape().last().unwrap())
+fn matrix<'a>(vectors: &'a Vectors, name: &str) -> (&'a [f32], usize) {
+    (vectors.floats(name), *vectors.shape(name).last().unwrap())
 }
 
-fn statistics(bytes: &[u8], name: &str) -> FeatureStatistics {
-    let (values, width) = matrix(bytes, name);
+fn statistics(vectors: &Vectors, name: &str) -> FeatureStatistics {
+    let (values, width) = matrix(vectors, name);
     let mut out = FeatureStatistics::new(width);
     values.chunks_exact(width).for_each(|row| out.add(row).unwrap());
     assert_eq!(out.count(), values.len() / width);
@@ -40,12 +33,12 @@ fn close(found: &[f64], expected: &[f32]) {
 #[test]
 fn frechet() {
     for name in ["d8_n100_n80", "d10_identical", "d48_rankdef_n20_n30", "d64_n500_n400"] {
-        let (bytes, json) = vectors(&format!("frechet_{name}"));
-        let (first, second) = (statistics(&bytes, "in/feat1"), statistics(&bytes, "in/feat2"));
-        close(&first.mean(), &matrix(&bytes, "out/mu1").0);
-        close(&second.mean(), &matrix(&bytes, "out/mu2").0);
-        close(&first.covariance(), &matrix(&bytes, "out/sigma1").0);
-        close(&second.covariance(), &matrix(&bytes, "out/sigma2").0);
+        let (v, json) = vectors(&format!("frechet_{name}"));
+        let (first, second) = (statistics(&v, "in/feat1"), statistics(&v, "in/feat2"));
+        close(&first.mean(), matrix(&v, "out/mu1").0);
+        close(&second.mean(), matrix(&v, "out/mu2").0);
+        close(&first.covariance(), matrix(&v, "out/sigma1").0);
+        close(&second.covariance(), matrix(&v, "out/sigma2").0);
         let expected = json["scalars_f64"]["frechet"].as_f64().unwrap();
         for found in [frechet_distance(&first, &second).unwrap(), frechet_distance(&second, &first).unwrap()] {
             // Far within the tolerance of the vectors, 1e-3 relative and 1e-2.
@@ -83,13 +76,13 @@ fn frechet_refuses_what_has_no_answer() {
 
 #[test]
 fn cosine() {
-    let (bytes, json) = vectors("cosine");
-    let ((a, width), (b, _)) = (matrix(&bytes, "in/a"), matrix(&bytes, "in/b"));
-    let (expected, _) = matrix(&bytes, "out/cosine");
+    let (v, json) = vectors("cosine");
+    let ((a, width), (b, _)) = (matrix(&v, "in/a"), matrix(&v, "in/b"));
+    let (expected, _) = matrix(&v, "out/cosine");
     let found: Vec<f64> =
         a.chunks_exact(width).zip(b.chunks_exact(width)).map(|(a, b)| cosine_similarity(a, b)).collect();
     assert_eq!(found.len(), expected.len());
-    for (f, &e) in found.iter().zip(&expected) {
+    for (f, &e) in found.iter().zip(expected) {
         assert!((f - f64::from(e)).abs() <= 1e-5, "expected {e}, found {f}");
     }
     let mean = found.iter().sum::<f64>() / found.len() as f64;

@@ -23,8 +23,8 @@ fn reference_matches_golden_vectors() {
             alpha.extend(image.alpha);
             depth.extend(image.depth);
             let grad = reference::ImageGrad {
-                rgb: doubles(&case.tensors["loss/w_rgb"][3 * i * pixels..3 * (i + 1) * pixels]),
-                alpha: doubles(&case.tensors["loss/w_alpha"][i * pixels..(i + 1) * pixels]),
+                rgb: doubles(&case.tensors.floats("loss/w_rgb")[3 * i * pixels..3 * (i + 1) * pixels]),
+                alpha: doubles(&case.tensors.floats("loss/w_alpha")[i * pixels..(i + 1) * pixels]),
                 depth: vec![0.0; pixels],
             };
             let (d, b) = reference::render_backward(&case.gaussians, camera, case.background, &case.config, &grad);
@@ -51,7 +51,7 @@ fn cpu_matches_golden_vectors() {
         case.compare_image("out/alpha", &alpha, 0.0, 1e-4);
         case.compare_image("out/depth_acc", &depth, 2e-4, 1e-4);
         case.compare_image("out/depth_exp", &expected_depth(&depth, &alpha), 2e-3, 1e-3);
-        let (w_rgb, w_alpha) = (&case.tensors["loss/w_rgb"], &case.tensors["loss/w_alpha"]);
+        let (w_rgb, w_alpha) = (case.tensors.floats("loss/w_rgb"), case.tensors.floats("loss/w_alpha"));
         let grads = render_backward(&case.gaussians, &out, w_rgb, w_alpha, &[]).unwrap();
         let d_background = grads.backgrounds.iter().fold([0.0; 3], |mut sum, d| {
             (0..3).for_each(|c| sum[c] += f64::from(d[c]));

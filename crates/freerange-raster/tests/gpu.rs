@@ -33,7 +33,7 @@ fn matches_golden_vectors() {
         let leaf = tensor(std::slice::from_ref(&case.gaussians), &device).require_grad();
         let backgrounds = [vec![case.background; views]];
         let image = rasterize(leaf.clone(), std::slice::from_ref(&case.cameras), &backgrounds, &case.config).unwrap();
-        let (w_rgb, w_alpha) = (&case.tensors["loss/w_rgb"], &case.tensors["loss/w_alpha"]);
+        let (w_rgb, w_alpha) = (case.tensors.floats("loss/w_rgb"), case.tensors.floats("loss/w_alpha"));
         let weights: Vec<f32> =
             w_rgb.chunks(3).zip(w_alpha).flat_map(|(rgb, alpha)| [rgb[0], rgb[1], rgb[2], *alpha]).collect();
         let weights = Tensor::<5>::from_data(TensorData::new(weights, image.dims()), &device);

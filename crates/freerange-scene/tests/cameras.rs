@@ -10,11 +10,11 @@ use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
 fn golden(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/golden/cameras").join(name)
+    freerange_vectors::path("cameras").join(name)
 }
 
 fn expected() -> Value {
-    serde_json::from_slice(&std::fs::read(golden("expected.json")).unwrap()).unwrap()
+    freerange_vectors::json("cameras/expected.json")
 }
 
 fn numbers(value: &Value) -> Vec<f64> {

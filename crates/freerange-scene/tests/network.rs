@@ -5,11 +5,11 @@ use freerange_scene::{LoadConfig, MaskKind, MaskModel, MaskSource, PixelRange, l
 use serde_json::json;
 use std::{
     collections::BTreeMap,
-    path::{Path, PathBuf},
+    path::PathBuf,
 };
 
 fn golden(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/golden/mask_network").join(name)
+    freerange_vectors::path("mask_network").join(name)
 }
 
 /// A scene of three times the golden photo.
@@ -41,7 +41,7 @@ fn masks(file: PathBuf, pixels: PixelRange) -> Result<Vec<u8>, String> {
 #[test]
 fn networks_give_the_masks_that_onnx_says_they_do() {
     let expected: BTreeMap<String, Vec<f64>> =
-        serde_json::from_str(&std::fs::read_to_string(golden("expected.json")).unwrap()).unwrap();
+        serde_json::from_value(freerange_vectors::json("mask_network/expected.json")).unwrap();
     assert_eq!(expected.len(), 8);
     for network in ["probabilities", "log_odds"] {
         for (name, range) in PixelRange::ALL {

@@ -55,9 +55,9 @@ impl Stopper {
 }
 
 /// One of the connections that may be open at a time.
-struct Place(Arc<Site>);
+struct Connection(Arc<Site>);
 
-impl Place {
+impl Connection {
     fn take(site: &Arc<Site>) -> Option<Self> {
         let place = Self(site.clone());
         let before = site.board.metrics.connections.fetch_add(1, Relaxed);
@@ -65,7 +65,7 @@ impl Place {
     }
 }
 
-impl Drop for Place {
+impl Drop for Connection {
     fn drop(&mut self) {
         self.0.board.metrics.connections.fetch_sub(1, Relaxed);
     }
@@ -124,8 +124,8 @@ impl Server {
                 continue;
             };
             let _ = stream.set_nodelay(true);
-            let place = Place::take(&self.site);
-            let full = place.is_none();
+            let connection = Connection::take(&self.site);
+            let full = connection.is_none();
             if full {
                 board.metrics.turned_away.fetch_add(1, Relaxed);
                 // In a moment there may be room; nothing is read, so that nobody can make us wait.
@@ -136,7 +136,7 @@ impl Server {
             }
             let site = self.site.clone();
             let talk = move || {
-                let _place = place;
+                let _connection = connection;
                 match Request::read(stream, patience) {
                     Ok(None) => {}
                     Ok(Some(request)) => serve(&site, request),

@@ -1,30 +1,18 @@
 //! Against vectors of independent references: `tests/golden/lod` and `tests/golden/flow`.
 
 use freerange_splat::{Alignment, Cloud, Gaussian, LodTree, Normalization, merge, patch};
+use freerange_vectors::Vectors;
 use glam::{DMat3, DQuat, DVec3};
-use safetensors::SafeTensors;
 
-struct Golden {
-    bytes: Vec<u8>,
-}
+struct Golden(Vectors);
 
 impl Golden {
     fn open(name: &str) -> Self {
-        let path = format!("{}/../../tests/golden/{name}.safetensors", env!("CARGO_MANIFEST_DIR"));
-        Self { bytes: std::fs::read(&path).unwrap_or_else(|e| panic!("{path}: {e}")) }
+        Self(Vectors::read(&format!("{name}.safetensors")))
     }
 
-    fn words(&self, name: &str) -> Vec<[u8; 4]> {
-        let tensors = SafeTensors::deserialize(&self.bytes).unwrap();
-        tensors.tensor(name).unwrap().data().as_chunks().0.to_vec()
-    }
-
-    fn f32(&self, name: &str) -> Vec<f32> {
-        self.words(name).into_iter().map(f32::from_le_bytes).collect()
-    }
-
-    fn i32(&self, name: &str) -> Vec<i32> {
-        self.words(name).into_iter().map(i32::from_le_bytes).collect()
+    fn f32(&self, name: &str) -> &[f32] {
+        self.0.floats(name)
     }
 
     fn rows<const N: usize>(&self, name: &str) -> Vec<[f64; N]> {
@@ -65,7 +53,7 @@ impl Expected {
             color: golden.rows(&name("color")),
             cov: golden.rows(&name("cov")),
             scales: golden.rows(&name(scales)),
-            opacity: golden.f32(&name("opacity")),
+            opacity: golden.f32(&name("opacity")).to_vec(),
         }
     }
 
@@ -102,7 +90,7 @@ fn trees_have_the_published_structure_and_nodes() {
         let expected = Expected::of(&golden, "node/", "scales_sorted");
         let [parent, children, level, height, leaf_index, leaf_count] =
             ["parent", "children", "level", "height", "leaf_index", "leaf_count"]
-                .map(|n| golden.i32(&format!("tree/{n}")));
+                .map(|n| golden.0.ints(&format!("tree/{n}")));
         for alignment in [Alignment::Parent, Alignment::Identity, Alignment::None] {
             let tree = LodTree::from_gaussians(leaves.clone(), alignment).unwrap();
             assert_eq!(tree.len(), leaves.len());
@@ -118,7 +106,7 @@ fn trees_have_the_published_structure_and_nodes() {
             }
             for depth in 0..=tree.depth_max() {
                 let ids: Vec<i32> = tree.slice_ids(depth).unwrap().into_iter().map(|i| i as i32).collect();
-                assert_eq!(ids, golden.i32(&format!("slice/level{depth}_node_ids")));
+                assert_eq!(ids, golden.0.ints(&format!("slice/level{depth}_node_ids")));
             }
         }
     }
@@ -183,15 +171,15 @@ fn normalisation_and_patches() {
     let golden = Golden::open("flow/fm");
     let array = |name: &str| <[f32; 14]>::try_from(golden.f32(name)).unwrap();
     let normalization = Normalization::new(array("in/mean"), array("in/std")).unwrap();
-    let z1 = golden.f32("in/z1"); // [7, 6, 14]
+    let z1 = golden.f32("in/z1").to_vec(); // [7, 6, 14]
     let limit = |expected: &[f32]| 1e-6 + 1e-5 * expected.iter().fold(0.0, |m: f32, v| m.max(v.abs()));
     let near = |found: &[f32], expected: &[f32]| {
         assert_eq!(found.len(), expected.len());
         let limit = limit(expected);
         found.iter().zip(expected).all(|(f, e)| (f - e).abs() <= limit)
     };
-    assert!(near(normalization.denormalize(&z1).rows(), &golden.f32("out/z1_denormalised")));
-    assert!(near(&normalization.normalize(&Cloud::from_rows(z1.clone())), &golden.f32("out/z1_normalised")));
+    assert!(near(normalization.denormalize(&z1).rows(), golden.f32("out/z1_denormalised")));
+    assert!(near(&normalization.normalize(&Cloud::from_rows(z1.clone())), golden.f32("out/z1_normalised")));
 
     let expected = golden.f32("out/patchified_z1"); // [7, 3, 28]
     for (sample, expected) in z1.chunks(6 * 14).zip(expected.chunks(3 * 28)) {

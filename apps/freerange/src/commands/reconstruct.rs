@@ -228,7 +228,7 @@ impl Watch {
 }
 
 #[derive(Serialize)]
-struct Report {
+struct SceneReport {
     scene: PathBuf,
     notes: Vec<String>,
     sampling: SampleConfig,
@@ -293,7 +293,7 @@ fn reconstruct(
     folder: &Path,
     begin: Instant,
     commit: impl FnOnce() -> Result<(), CliError>,
-) -> Result<(Report, String), CliError> {
+) -> Result<(SceneReport, String), CliError> {
     let mut inputs = scene.loaded.views;
     let mut further = scene.loaded.further;
     if let Some(path) = &args.validate {
@@ -352,7 +352,7 @@ fn reconstruct(
     seconds.push(("write", begin.elapsed().as_secs_f64()));
 
     notes.extend(result.notes);
-    let report = Report {
+    let report = SceneReport {
         scene: path.into(),
         notes,
         sampling: options.sample,
@@ -385,7 +385,7 @@ fn comparisons(cloud: &freerange::Cloud, views: &[View]) -> Result<Vec<(String, 
         .collect()
 }
 
-fn print(report: &Report, output: &Path) {
+fn print(report: &SceneReport, output: &Path) {
     for note in &report.notes {
         println!("note: {note}");
     }

@@ -257,7 +257,7 @@ fn other_objects_are_measured_now_and_then_and_nothing_else_changes() {
 #[test]
 fn the_frozen_encoder_is_neither_averaged_nor_optimised_nor_saved() {
     let place = tempfile::tempdir().unwrap();
-    let golden = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/dino/mlp_img56"));
+    let golden = freerange_vectors::path("dino/mlp_img56");
     let weights = EncoderWeights { name: "golden".into(), folder: golden.clone() };
     let mut config = config();
     let encoder = Dinov2::load(&golden, &Device::flex()).unwrap();

@@ -20,12 +20,19 @@ use crate::{
     ops::Compute,
 };
 
+/// What a patch is turned into.
+#[derive(Module, Debug)]
+enum Appearance {
+    /// Its pixels, or what a small network of the model's own makes of them.
+    Patch(Option<PatchMlp>),
+    /// The features of a frozen, published network; none while that is taken out.
+    Dinov2(Option<Dinov2>),
+}
+
 /// Turns posed images into image tokens.
 #[derive(Module, Debug)]
 pub struct ImageEncoder {
-    patch: Option<PatchMlp>,
-    dinov2: Option<Dinov2>, // none, too, while it is taken out
-    outside: bool,
+    appearance: Appearance,
     patch_size: usize,
     channels: usize,
     position_features: usize,
@@ -38,14 +45,15 @@ impl ImageEncoder {
         prefix: &str,
         builder: &mut Builder<'_, S>,
     ) -> Result<Self, ModelError> {
-        let patch = match &config.encoder {
-            EncoderConfig::Patch(c) if c.patch_hidden > 0 => Some(PatchMlp::build(c, prefix, builder)?),
-            _ => None,
+        let appearance = match &config.encoder {
+            EncoderConfig::Patch(c) if c.patch_hidden > 0 => {
+                Appearance::Patch(Some(PatchMlp::build(c, prefix, builder)?))
+            }
+            EncoderConfig::Patch(_) => Appearance::Patch(None),
+            EncoderConfig::Dinov2(_) => Appearance::Dinov2(dinov2),
         };
         Ok(Self {
-            patch,
-            dinov2,
-            outside: matches!(config.encoder, EncoderConfig::Dinov2(_)),
+            appearance,
             patch_size: config.encoder.patch_size() as usize,
             channels: config.encoder.channels(),
             position_features: config.position_features,
@@ -54,17 +62,23 @@ impl ImageEncoder {
 
     /// The frozen DINOv2, if this encoder has one.
     pub fn dinov2(&self) -> Option<&Dinov2> {
-        self.dinov2.as_ref()
+        match &self.appearance {
+            Appearance::Dinov2(dinov2) => dinov2.as_ref(),
+            Appearance::Patch(_) => None,
+        }
     }
 
     pub(crate) fn set_compute(&mut self, compute: Compute) {
-        if let Some(dinov2) = &mut self.dinov2 {
+        if let Appearance::Dinov2(Some(dinov2)) = &mut self.appearance {
             dinov2.set_compute(compute);
         }
     }
 
     pub(crate) fn replace_dinov2(&mut self, dinov2: Option<Dinov2>) -> Option<Dinov2> {
-        std::mem::replace(&mut self.dinov2, dinov2)
+        match &mut self.appearance {
+            Appearance::Dinov2(own) => std::mem::replace(own, dinov2),
+            Appearance::Patch(_) => None,
+        }
     }
 
     /// Image tokens.
@@ -80,7 +94,6 @@ impl ImageEncoder {
         let [b, views, h, w, channels] = images.dims();
         let p = self.patch_size;
         let (rows, columns) = (h / p, w / p);
-        assert_eq!(self.outside, self.dinov2.is_some(), "the frozen encoder is in its place");
         assert_eq!(channels, self.channels, "channels of the images");
         assert!(h == rows * p && w == columns * p, "{h} x {w} images are not whole patches of {p}");
         assert_eq!(plucker.dims(), [b, views, rows, columns, PLUCKER], "one ray per patch");
@@ -88,14 +101,15 @@ impl ImageEncoder {
 
         let patches = patch::patches(images.clone(), p) * 2.0 - 1.0; // [b, tokens, p * p * channels]
         let colour = patches.clone().reshape([b, tokens, p * p, channels]).mean_dim(2).reshape([b, tokens, channels]);
-        let features = match (&self.dinov2, &self.patch) {
-            (Some(dinov2), _) => {
+        let features = match &self.appearance {
+            Appearance::Dinov2(dinov2) => {
+                let dinov2 = dinov2.as_ref().expect("the frozen encoder is in its place");
                 let images = images.reshape([b * views, h, w, channels]).permute([0, 3, 1, 2]);
                 let features = dinov2.patch_features(dinov2::imagenet_normalised(images)).detach();
                 features.reshape([b, tokens, dinov2.hidden()])
             }
-            (None, Some(mlp)) => mlp.forward(patches),
-            (None, None) => patches,
+            Appearance::Patch(Some(mlp)) => mlp.forward(patches),
+            Appearance::Patch(None) => patches,
         };
         let position = position_embedding(rows, columns, self.position_features);
         let position = TensorData::new(position, [1, rows * columns, self.position_features]);

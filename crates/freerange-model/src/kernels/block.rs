@@ -67,7 +67,7 @@ pub(crate) struct Saved<B: Backend> {
     normed_f: FloatTensor<B>, // [b, q, d]
     inner: Product<B>,        // [b, q, 2 f]
     hidden: FloatTensor<B>,   // [b, q, f]
-    fed: Product<B>,          // [b, q, d]
+    down: Product<B>,          // [b, q, d]
 }
 
 /// Part `i` of `n` of the last axis of `[b, n d]`.
@@ -119,10 +119,10 @@ pub(crate) fn forward<B: Kernels>(
     let saved_inner = kept(keep, &inner);
     let hidden = B::geglu_forward(inner);
     let saved_hidden = kept(keep, &hidden);
-    let fed = B::product_forward(hidden, w.down.clone(), w.down_bias.clone(), compute);
-    let saved_fed = kept(keep, &fed);
+    let down = B::product_forward(hidden, w.down.clone(), w.down_bias.clone(), compute);
+    let saved_down = kept(keep, &down);
     let saved_middle = kept(keep, &middle);
-    let out = B::gated_add_forward(middle, m(5), fed);
+    let out = B::gated_add_forward(middle, m(5), down);
 
     let saved = || {
         Some(Saved {
@@ -135,7 +135,7 @@ pub(crate) fn forward<B: Kernels>(
             normed_f: saved_normed_f?,
             inner: saved_inner?,
             hidden: saved_hidden?,
-            fed: saved_fed?,
+            down: saved_down?,
         })
     };
     (out, if keep { saved() } else { None })
@@ -154,8 +154,8 @@ pub(crate) fn backward<B: Kernels>(
     let m = |i: usize| part::<B>(modulation, i, 6);
     let bias = |gradient: Option<FloatTensor<B>>| gradient.expect("all products have a bias");
 
-    let ([d_gate_f, d_fed], d_down_bias) = B::gated_add_backward(m(5), saved.fed, grad.clone());
-    let [d_hidden, d_down] = B::product_backward(saved.hidden, w.down.clone(), d_fed, compute);
+    let ([d_gate_f, d_down_out], d_down_bias) = B::gated_add_backward(m(5), saved.down, grad.clone());
+    let [d_hidden, d_down] = B::product_backward(saved.hidden, w.down.clone(), d_down_out, compute);
     let (d_inner, d_in_bias) = B::geglu_backward(saved.inner, d_hidden);
     let [d_normed_f, d_in] = B::product_backward(saved.normed_f, w.inner.clone(), d_inner, compute);
     let [d_middle, d_shift_f, d_scale_f] =

@@ -18,7 +18,7 @@ const GROUPS: usize = 16;
 
 /// Where a unit is.
 #[derive(CubeType)]
-pub struct Place {
+pub struct Pixel {
     /// In the group.
     pub image: usize,
     /// First word of the tile's mask.
@@ -35,7 +35,7 @@ pub struct Place {
 }
 
 #[cube]
-pub fn place(frame: &Frame) -> Place {
+pub fn place(frame: &Frame) -> Pixel {
     let tiles = frame.tiles as usize;
     let image = CUBE_POS / tiles;
     let tile = (CUBE_POS % tiles) as u32;
@@ -43,7 +43,7 @@ pub fn place(frame: &Frame) -> Place {
     let corner_y = tile / frame.tiles_across * TILE as u32;
     let column = corner_x + UNIT_POS % TILE as u32;
     let row = corner_y + UNIT_POS / TILE as u32;
-    Place {
+    Pixel {
         image,
         mask: CUBE_POS * frame.words as usize,
         pixel: (image * frame.height as usize + row as usize) * frame.width as usize + column as usize,

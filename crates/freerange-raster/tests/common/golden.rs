@@ -4,11 +4,9 @@
 
 use freerange_camera::Camera;
 use freerange_raster::RasterConfig;
+use freerange_vectors::{Vectors, json, path};
 use glam::DMat4;
-use safetensors::SafeTensors;
-use std::collections::BTreeMap;
 
-const FOLDER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/raster");
 /// Tensors and their channels in a row of 14.
 const CHANNELS: [(&str, std::ops::Range<usize>); 5] =
     [("means", 0..3), ("log_scales", 3..6), ("quats", 6..10), ("logit_opacities", 10..11), ("colors", 11..14)];
@@ -16,8 +14,7 @@ const CHANNELS: [(&str, std::ops::Range<usize>); 5] =
 /// One scene, and what it should look like.
 pub struct Case {
     pub name: String,
-    /// All tensors of the file that are float32.
-    pub tensors: BTreeMap<String, Vec<f32>>,
+    pub tensors: Vectors,
     pub fragile: Vec<bool>, // [views, height, width]
     /// `[n, 14]`
     pub gaussians: Vec<f32>,
@@ -28,38 +25,20 @@ pub struct Case {
 
 impl Case {
     fn load(name: &str) -> Self {
-        let bytes = std::fs::read(format!("{FOLDER}/{name}.safetensors")).unwrap();
-        let json: serde_json::Value =
-            serde_json::from_slice(&std::fs::read(format!("{FOLDER}/{name}.json")).unwrap()).unwrap();
-        let file = SafeTensors::deserialize(&bytes).unwrap();
-        let mut tensors = BTreeMap::new();
-        let mut fragile = vec![];
-        for (name, view) in file.tensors() {
-            match view.dtype() {
-                safetensors::Dtype::F32 => {
-                    let floats: Vec<f32> =
-                        view.data().as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
-                    tensors.insert(name.to_string(), floats);
-                }
-                safetensors::Dtype::U8 if name == "aux/fragile" => {
-                    fragile = view.data().iter().map(|v| *v != 0).collect()
-                }
-                _ => {}
-            }
-        }
-        let meta = &json["meta"];
+        let tensors = Vectors::read(&format!("raster/{name}.safetensors"));
+        let fragile = tensors.bytes("aux/fragile").iter().map(|v| *v != 0).collect();
+        let meta = &json(&format!("raster/{name}.json"))["meta"];
         let number = |key: &str| meta[key].as_f64().unwrap();
         let n = number("N") as usize;
         let mut gaussians = vec![0.0; 14 * n];
         for (tensor, range) in CHANNELS {
-            let values = &tensors[&format!("in/{tensor}")];
+            let values = tensors.floats(&format!("in/{tensor}"));
             for i in 0..n {
                 gaussians[14 * i + range.start..14 * i + range.end]
                     .copy_from_slice(&values[i * range.len()..][..range.len()]);
             }
         }
-        let f64s = |name: &str| -> Vec<f64> { tensors[name].iter().map(|v| f64::from(*v)).collect() };
-        let (matrices, intrinsics) = (f64s("in/viewmats"), f64s("in/Ks"));
+        let (matrices, intrinsics) = (tensors.doubles("in/viewmats"), tensors.doubles("in/Ks"));
         let cameras = (0..number("C") as usize)
             .map(|i| {
                 let k = &intrinsics[9 * i..9 * i + 9];
@@ -74,22 +53,22 @@ impl Case {
                 }
             })
             .collect();
-        let background = tensors["in/background"].as_slice().try_into().unwrap();
+        let background = tensors.floats("in/background").try_into().unwrap();
         let config = RasterConfig { near: number("near_plane") as f32, depth: true, ..RasterConfig::default() };
         Self { name: name.into(), tensors, fragile, gaussians, cameras, background, config }
     }
 
     /// Compares with the tensor `name`; `channels` values per pixel. The tolerance is relative to the largest value, plus absolute.
     pub fn compare_image(&self, name: &str, found: &[f64], relative: f64, absolute: f64) {
-        let expected = &self.tensors[name];
+        let expected = self.tensors.floats(name);
         let channels = expected.len() / self.fragile.len();
-        let alpha = &self.tensors["out/alpha"];
+        let alpha = self.tensors.floats("out/alpha");
         let skip = |pixel: usize| self.fragile[pixel] || (name == "out/depth_exp" && alpha[pixel] <= 1e-2);
         self.compare(name, found, relative, absolute, |i| skip(i / channels));
     }
 
     pub fn compare(&self, name: &str, found: &[f64], relative: f64, absolute: f64, skip: impl Fn(usize) -> bool) {
-        let expected = &self.tensors[name];
+        let expected = self.tensors.floats(name);
         assert_eq!(found.len(), expected.len(), "{} {name}", self.name);
         let largest = expected.iter().fold(0.0, |m: f32, v| m.max(v.abs()));
         let mut worst = 0.0f64;
@@ -116,7 +95,7 @@ impl Case {
 
 /// All of them.
 pub fn cases() -> Vec<Case> {
-    let mut names: Vec<String> = std::fs::read_dir(FOLDER)
+    let mut names: Vec<String> = std::fs::read_dir(path("raster"))
         .unwrap()
         .filter_map(|e| e.unwrap().file_name().to_str()?.strip_suffix(".json").map(String::from))
         .collect();

@@ -126,10 +126,10 @@ pub fn sample(
     let branches = if settings.cfg_scale == 1.0 { 1 } else { 2 };
     let tokens = tokens.repeat_dim(0, branches);
     let normal = |b: usize| Tensor::<3>::random([b, n, 14], Distribution::Normal(0.0, 1.0), device);
-    let (z, hint) = (normal(branches * b), normal(branches * b));
+    let (z, gradient) = (normal(branches * b), normal(branches * b));
     let t = Tensor::<1>::full([branches * b], 0.5, device);
-    let hint = model_config.gradient_channels.then_some(hint);
-    let transformer_seconds = timer.time(|| Ok(model.denoise(z.clone(), hint.clone(), tokens.clone(), t.clone())))?;
+    let gradient = model_config.gradient_channels.then_some(gradient);
+    let transformer_seconds = timer.time(|| Ok(model.denoise(z.clone(), gradient.clone(), tokens.clone(), t.clone())))?;
     let photometric = Photometric::new(&checkpoint.normalization, device);
     let start = normal(b);
     let gradient_at = |size: u32| {

@@ -131,7 +131,7 @@ impl Settings {
         object.gaussians = given.or(default_source).unwrap_or(object.gaussians);
         if let Some(n) = self.leaves {
             object.surface.points = n;
-            object.fit.max_gaussians = n;
+            object.fit.cap_max = n;
             object.fit.initial = n;
         }
         object.views = self.views.unwrap_or(object.views);

@@ -11,7 +11,7 @@ use freerange::{Reconstructor, Scores, checkpoint_sha256};
 use freerange_core::write_atomically;
 use serde::{Deserialize, Serialize};
 
-use super::{Args, Report};
+use super::{Args, SceneReport};
 use crate::{error::CliError, runtime::local_or_shipped};
 
 /// In each scene's folder, once it is finished: what it was made with, and how it went.
@@ -303,7 +303,7 @@ fn stamps(files: &[PathBuf]) -> Result<BTreeMap<PathBuf, String>, CliError> {
     files.iter().map(stamp).collect()
 }
 
-fn row(entry: &Entry, report: &Report, seconds: f64) -> Row {
+fn row(entry: &Entry, report: &SceneReport, seconds: f64) -> Row {
     let first = report.samples.first();
     Row {
         scene: entry.name.clone(),

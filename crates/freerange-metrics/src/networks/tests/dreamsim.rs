@@ -1,6 +1,8 @@
 use std::path::Path;
 
-use super::{Vectors, device, golden, json};
+use freerange_vectors::{json, json_at};
+
+use super::{Vectors, device, golden, image};
 use crate::{
     MetricsError,
     networks::{
@@ -11,7 +13,7 @@ use crate::{
 };
 
 pub(super) fn load(folder: &Path, adapter: &Path, branches: usize) -> Result<DreamSim, MetricsError> {
-    let shape = &json(golden("networks/dreamsim.json"))["shape"];
+    let shape = &json("metrics/networks/dreamsim.json")["shape"];
     let n = |name: &str| shape[name].as_u64().unwrap() as usize;
     let (width, depth, heads, patch, side) = (n("width"), n("depth"), n("heads"), n("patch"), n("side"));
     let dino = VitConfig { width, depth, heads, patch, side, ..DINO_B16 };
@@ -31,8 +33,8 @@ pub(super) fn load(folder: &Path, adapter: &Path, branches: usize) -> Result<Dre
 fn distances_are_the_packages() {
     let folder = golden("networks");
     let v = Vectors::open(&folder.join("dreamsim.safetensors"));
-    let distances = json(folder.join("dreamsim.json"))["distances"].clone();
-    let images: Vec<_> = (0..3).map(|i| v.images[&format!("in/image{i}")].clone()).collect();
+    let distances = json_at(&folder.join("dreamsim.json"))["distances"].clone();
+    let images: Vec<_> = (0..3).map(|i| image(&v, &format!("in/image{i}"))).collect();
     for (label, branches) in [("dino", 1), ("ensemble", 3)] {
         let network = load(&folder, &folder.join(format!("{label}_lora")), branches).unwrap();
         let embeddings = network.embed(&images);

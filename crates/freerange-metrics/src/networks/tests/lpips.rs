@@ -1,9 +1,10 @@
 use std::{collections::HashMap, path::PathBuf};
 
 use burn::tensor::Tensor;
+use freerange_vectors::json_at;
 use sha2::{Digest, Sha256};
 
-use super::{Vectors, close, device, golden, json, uniform};
+use super::{Vectors, close, device, golden, tensor, uniform};
 use crate::{
     MetricsError,
     networks::{
@@ -34,14 +35,13 @@ impl Source for InFile<'_> {
     fn values(&mut self, name: &str, _: &[usize]) -> Result<Vec<f32>, MetricsError> {
         let name = name.strip_suffix(".model.1.weight").unwrap_or(name); // heads have short names there
         let weight = format!("net/{name}");
-        let found = self.0.floats.get(name).or_else(|| self.0.floats.get(&weight));
-        Ok(found.unwrap_or_else(|| panic!("{name}: {:?}", self.0.floats.keys())).1.clone())
+        Ok(self.0.floats(if self.0.has(name) { name } else { &weight }).to_vec())
     }
 }
 
 fn check(net: LpipsNet, path: PathBuf, procedural: bool) {
     let v = Vectors::open(&path);
-    let expected = json(path.with_extension("json"));
+    let expected = json_at(&path.with_extension("json"));
     let mut heads = InFile(&v);
     let lpips = match procedural {
         true => Lpips::build(net, &mut Rule(expected.clone()), &mut heads, &device()),
@@ -52,7 +52,7 @@ fn check(net: LpipsNet, path: PathBuf, procedural: bool) {
     let sizes: Vec<&str> = scalars.keys().filter_map(|key| key.strip_prefix("lpips_same_")).collect();
     assert!(!sizes.is_empty());
     for size in sizes {
-        let unit = |name: &str| (v.tensor(&format!("in/{name}_{size}")) + 1.0) / 2.0;
+        let unit = |name: &str| (tensor(&v, &format!("in/{name}_{size}")) + 1.0) / 2.0;
         let (a, b): (Tensor<4>, Tensor<4>) = (unit("img0"), unit("img1"));
         let found = f64::from(host(lpips.distance(a.clone(), b))[0]);
         let truth = scalars[&format!("lpips_{size}")];
@@ -60,7 +60,9 @@ fn check(net: LpipsNet, path: PathBuf, procedural: bool) {
         assert_eq!(host(lpips.distance(a.clone(), a.clone()))[0], 0.0, "equal images");
         let features = lpips.features(a);
         for layer in [1, 5] {
-            if let Some((_, expected)) = v.floats.get(&format!("out/relu{layer}_{size}")) {
+            let name = format!("out/relu{layer}_{size}");
+            if v.has(&name) {
+                let expected = v.floats(&name);
                 let largest = expected.iter().fold(0.0f32, |m, x| m.max(x.abs()));
                 close(&host(features[layer - 1].clone()), expected, 1e-4 * largest + 1e-5);
             }
@@ -89,7 +91,7 @@ fn published_heads_are_read() {
     let v = Vectors::open(&golden("lpips_alex_procedural_3102.safetensors"));
     for (i, channels) in [64, 192, 384, 256, 256].into_iter().enumerate() {
         let found = file.values(&format!("lin{i}.model.1.weight"), &[1, channels, 1, 1]).unwrap();
-        assert_eq!(found, v.values(&format!("lin{i}")));
+        assert_eq!(found, v.floats(&format!("lin{i}")));
     }
 }
 

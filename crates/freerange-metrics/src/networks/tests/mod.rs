@@ -8,10 +8,10 @@ mod lpips;
 mod resize;
 mod speed;
 
-use std::{collections::HashMap, path::PathBuf};
+use std::path::PathBuf;
 
 use burn::tensor::{Device, Tensor, TensorData};
-use safetensors::SafeTensors;
+use freerange_vectors::Vectors;
 
 use super::{resize::Image8, source::Source};
 use crate::MetricsError;
@@ -21,52 +21,16 @@ fn device() -> Device {
 }
 
 pub(super) fn golden(name: &str) -> PathBuf {
-    PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden/metrics")).join(name)
+    freerange_vectors::path("metrics").join(name)
 }
 
-/// A file of vectors.
-struct Vectors {
-    floats: HashMap<String, (Vec<usize>, Vec<f32>)>,
-    images: HashMap<String, Image8>,
+fn image(vectors: &Vectors, name: &str) -> Image8 {
+    let shape = vectors.shape(name);
+    Image8 { width: shape[1], height: shape[0], values: vectors.bytes(name).to_vec() }
 }
 
-impl Vectors {
-    fn open(path: &std::path::Path) -> Self {
-        let bytes = std::fs::read(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
-        let file = SafeTensors::deserialize(&bytes).unwrap();
-        let (mut floats, mut images) = (HashMap::new(), HashMap::new());
-        for (name, view) in file.iter() {
-            let shape = view.shape().to_vec();
-            match view.dtype() {
-                safetensors::Dtype::U8 => {
-                    let image = Image8 { width: shape[1], height: shape[0], values: view.data().to_vec() };
-                    images.insert(name.to_owned(), image);
-                }
-                safetensors::Dtype::F16 => {
-                    let f16 = |b: &[u8; 2]| burn::tensor::f16::from_le_bytes(*b).to_f32();
-                    floats.insert(name.to_owned(), (shape, view.data().as_chunks().0.iter().map(f16).collect()));
-                }
-                _ => {
-                    let f32 = |b: &[u8; 4]| f32::from_le_bytes(*b);
-                    floats.insert(name.to_owned(), (shape, view.data().as_chunks().0.iter().map(f32).collect()));
-                }
-            }
-        }
-        Self { floats, images }
-    }
-
-    fn values(&self, name: &str) -> &[f32] {
-        &self.floats[name].1
-    }
-
-    fn tensor(&self, name: &str) -> Tensor<4> {
-        let (shape, values) = &self.floats[name];
-        Tensor::from_data(TensorData::new(values.clone(), shape.clone()), &device())
-    }
-}
-
-fn json(path: PathBuf) -> serde_json::Value {
-    serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap()
+fn tensor(vectors: &Vectors, name: &str) -> Tensor<4> {
+    Tensor::from_data(TensorData::new(vectors.floats(name).to_vec(), vectors.shape(name).to_vec()), &device())
 }
 
 /// `low..high` by splitmix64, 24 bits each.

@@ -1,13 +1,13 @@
-use super::{Vectors, close, golden};
+use super::{Vectors, close, golden, image};
 use crate::networks::{dino, resize::Image8};
 
 #[test]
 fn bicubic_is_pillows() {
     let v = Vectors::open(&golden("networks/resize.safetensors"));
     for name in ["down", "up", "wide"] {
-        let expected = &v.images[&format!("out/{name}")];
-        let found = v.images[&format!("in/{name}")].bicubic(expected.width, expected.height);
-        assert_eq!(&found, expected, "{name}");
+        let expected = image(&v, &format!("out/{name}"));
+        let found = image(&v, &format!("in/{name}")).bicubic(expected.width, expected.height);
+        assert_eq!(found, expected, "{name}");
     }
 }
 
@@ -34,10 +34,11 @@ fn dino_preparation_is_hugging_faces() {
     for name in ["prep_a", "prep_b"] {
         let v = Vectors::open(&std::path::Path::new(&shared).join(format!("golden/dev/dino/{name}.safetensors")));
         let mut found = Vec::new();
-        dino::prepare(&v.images["in/image_u8"], &mut found);
-        close(&found, v.values("out/hf_hfirst_pixel_values"), 0.02);
+        let image_u8 = image(&v, "in/image_u8");
+        dino::prepare(&image_u8, &mut found);
+        close(&found, v.floats("out/hf_hfirst_pixel_values"), 0.02);
         // That reference has weights of full precision; Pillow's have 22 bits.
-        let (found, expected) = (v.images["in/image_u8"].bicubic(224, 224), &v.images["out/resize_hfirst_224_u8"]);
+        let (found, expected) = (image_u8.bicubic(224, 224), image(&v, "out/resize_hfirst_224_u8"));
         let differences = found.values.iter().zip(&expected.values).map(|(a, b)| a.abs_diff(*b));
         assert!(differences.clone().all(|d| d <= 1));
         assert!(differences.filter(|d| *d > 0).count() * 50 <= found.values.len());

@@ -8,7 +8,7 @@ use super::{
         linear::Matrix,
         math,
     },
-    Place, SIDE, Start, Tile, Unit,
+    Destination, SIDE, Start, Tile, Unit,
     pack::{Lines, tiles},
     with_tiles,
 };
@@ -20,8 +20,8 @@ const KEYS: usize = 2 * SIDE;
 ///
 /// # Safety
 /// As of [`Unit::multiply`], for all of the result.
-unsafe fn multiply(unit: &Unit, steps: usize, left: &[Tile], right: &[Tile], start: Start, place: Place) {
-    let Place { out, stride, rows, columns } = place;
+unsafe fn multiply(unit: &Unit, steps: usize, left: &[Tile], right: &[Tile], start: Start, place: Destination) {
+    let Destination { out, stride, rows, columns } = place;
     for j in 0..columns.div_ceil(SIDE) {
         for i in 0..rows.div_ceil(SIDE) {
             let strip = |tiles: &'_ [Tile], i: usize| -> std::ops::Range<usize> {
@@ -33,7 +33,7 @@ unsafe fn multiply(unit: &Unit, steps: usize, left: &[Tile], right: &[Tile], sta
             // SAFETY: the caller's promise for this part of the result.
             unsafe {
                 let out = out.add(row * stride + column);
-                let place = Place { out, stride, rows, columns };
+                let place = Destination { out, stride, rows, columns };
                 unit.multiply(&left[strip(left, i)], &right[strip(right, j)], start, place);
             }
         }
@@ -44,7 +44,7 @@ unsafe fn multiply(unit: &Unit, steps: usize, left: &[Tile], right: &[Tile], sta
 fn product(unit: &Unit, steps: usize, left: &[Tile], right: &[Tile], out: &mut [f32], rows: usize, columns: usize) {
     let stride = columns.next_multiple_of(SIDE);
     assert!(out.len() >= rows * stride);
-    let place = Place { out: out.as_mut_ptr(), stride, rows, columns: stride };
+    let place = Destination { out: out.as_mut_ptr(), stride, rows, columns: stride };
     // SAFETY: exclusively borrowed.
     unsafe { multiply(unit, steps, left, right, Start::Zeros, place) }
 }
@@ -155,7 +155,7 @@ pub unsafe fn head_backward(
             product(&unit, inner, v_tiles, g_deep, &mut dp, n, queries);
             score_gradients(&mut p, &mut dp, n, long, saved.log_sum, &delta);
             let into = |tiles: &[Tile], right: &[Tile], out: *mut f32, stride: usize| {
-                let place = Place { out, stride, rows: n, columns: width };
+                let place = Destination { out, stride, rows: n, columns: width };
                 // SAFETY: rows of `dk`, or this head's columns of values by the caller's promise.
                 unsafe { multiply(&unit, outer, tiles, right, Start::Zeros, place) }
             };
@@ -168,7 +168,7 @@ pub unsafe fn head_backward(
             // The queries' gradient is summed over keys: transposed, since that is how its operands lie.
             Lines::left(k.transposed(), width, n).pack(k_across);
             Lines::right(ds, n, queries).pack(right);
-            let place = Place { out: dq_across.as_mut_ptr(), stride: long, rows: wide, columns: long };
+            let place = Destination { out: dq_across.as_mut_ptr(), stride: long, rows: wide, columns: long };
             let start = if first > 0 { Start::Result } else { Start::Zeros };
             // SAFETY: all of `dq_across`, which is ours.
             unsafe { multiply(&unit, n.div_ceil(SIDE), k_across, right, start, place) };

@@ -72,7 +72,7 @@ pub enum Start<'a> {
 
 /// Where a product goes: up to 32 rows of up to 32 columns, rows `stride` apart.
 #[derive(Clone, Copy)]
-pub struct Place {
+pub struct Destination {
     pub out: *mut f32,
     pub stride: usize,
     pub rows: usize,
@@ -101,9 +101,9 @@ impl Unit {
     /// `place` must be valid for writes of its rows and columns, for reads too if it is what to start from, and nothing
     /// else may touch those meanwhile.
     #[inline]
-    pub unsafe fn multiply(&self, left: &[Tile], right: &[Tile], start: Start, place: Place) {
+    pub unsafe fn multiply(&self, left: &[Tile], right: &[Tile], start: Start, place: Destination) {
         assert!(left.len() == right.len() && left.len().is_multiple_of(2), "strips of the same depth");
-        let Place { out, stride, rows, columns } = place;
+        let Destination { out, stride, rows, columns } = place;
         let (from, from_stride) = match start {
             Start::Zeros => (std::ptr::null(), 0),
             Start::Result => (out.cast_const(), stride),

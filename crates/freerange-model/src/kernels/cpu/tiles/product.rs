@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use super::{
     super::{Shared, linear::Matrix},
-    Place, SIDE, Start, Tile, Unit,
+    Destination, SIDE, Start, Tile, Unit,
     pack::Lines,
     with_tiles,
 };
@@ -88,7 +88,7 @@ pub fn product([m, k, n]: [usize; 3], a: Matrix, b: Matrix, bias: Option<&[f32]>
                         // SAFETY: this task alone writes these rows, all within `out`; what it reads, it has written.
                         unsafe {
                             let out = target.at(row * n + column);
-                            unit.multiply(left_tiles, right_tiles, start, Place { out, stride: n, rows, columns });
+                            unit.multiply(left_tiles, right_tiles, start, Destination { out, stride: n, rows, columns });
                         }
                     }
                 }

@@ -101,7 +101,7 @@ fn vectors_multiply_as_well() {
         let unit = Unit::of(Engine::Vectors);
         let mut out = vec![0f32; m * n];
         let mut check = |start: Start, expected: &dyn Fn(usize, f64) -> f64| {
-            let place = Place { out: out.as_mut_ptr(), stride: n, rows: m, columns: n };
+            let place = Destination { out: out.as_mut_ptr(), stride: n, rows: m, columns: n };
             // SAFETY: all of `out`, which is ours.
             unsafe { unit.multiply(left_tiles, right_tiles, start, place) };
             for (i, (found, truth)) in out.iter().zip(naive([m, k, n], a, b, None)).enumerate() {
