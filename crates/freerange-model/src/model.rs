@@ -166,8 +166,8 @@ pub(crate) fn torch_name(path: &[String]) -> String {
         ("dit.t_mlp.first.", "dit.t_mlp.0."),
         ("dit.t_mlp.second.", "dit.t_mlp.2."),
         ("dit.output.", "dit.final."),
-        ("encoder.patch.first.", "encoder.patch.0."),
-        ("encoder.patch.second.", "encoder.patch.2."),
+        ("encoder.appearance.Patch.first.", "encoder.patch.0."),
+        ("encoder.appearance.Patch.second.", "encoder.patch.2."),
     ] {
         if let Some(rest) = name.strip_prefix(ours) {
             name = format!("{torch}{rest}");
@@ -178,7 +178,7 @@ pub(crate) fn torch_name(path: &[String]) -> String {
 
 /// Frozen weights are no parameters.
 fn is_frozen(path: &[String]) -> bool {
-    path.starts_with(&["encoder".to_owned(), "dinov2".to_owned()])
+    path.starts_with(&["encoder", "appearance", "Dinov2"].map(str::to_owned))
 }
 
 struct Collector {
