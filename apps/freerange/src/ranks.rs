@@ -36,14 +36,26 @@ struct End {
 }
 
 impl Job {
+    /// This process alone, whoever else was started: for work that is not shared, or has been by the user.
+    pub fn alone() -> Self {
+        Self { ranks: Rc::new(Single), local: [0, 1] }
+    }
+
+    /// As [`start`](Self::start), or [`alone`](Self::alone).
+    ///
+    /// # Errors
+    /// As [`start`](Self::start).
+    pub fn start_if(shared: bool) -> Result<Self, CliError> {
+        if shared { Self::start() } else { Ok(Self::alone()) }
+    }
+
     /// Joins the other processes that were started with this one; without a launcher there are none.
     ///
     /// # Errors
     /// A launcher that started several processes, where they cannot find each other.
     pub fn start() -> Result<Self, CliError> {
-        let single = Self { ranks: Rc::new(Single), local: [0, 1] };
-        let Some(launched) = launched(|name| env::var(name).ok()) else { return Ok(single) };
-        let Some(ranks) = connect(&launched)? else { return Ok(single) };
+        let Some(launched) = launched(|name| env::var(name).ok()) else { return Ok(Self::alone()) };
+        let Some(ranks) = connect(&launched)? else { return Ok(Self::alone()) };
         let job = Self { ranks, local: [0, 1] };
         match job.find_place() {
             Ok(local) => Ok(Self { local, ..job }),
@@ -61,18 +73,9 @@ impl Job {
         self.ranks.world()
     }
 
-    /// The share of numbered work that this process does: the one asked for, else the rank's.
-    ///
-    /// # Errors
-    /// Where a share is asked for of what is shared already.
-    pub fn share(&self, asked: Option<(usize, usize)>) -> Result<(usize, usize), CliError> {
-        match (asked, self.world()) {
-            (Some(share), 1) => Ok(share),
-            (None, world) => Ok((self.ranks.rank(), world)),
-            (Some((i, n)), world) => Err(CliError::input(format!(
-                "--share: expected none where {world} processes of a launcher share the work, found {i}/{n}"
-            ))),
-        }
+    /// The share of numbered work that this process does: its number, and of how many.
+    pub fn share(&self) -> (usize, usize) {
+        (self.ranks.rank(), self.world())
     }
 
     /// The device of this process. Where processes of one machine are to find one themselves, each takes another GPU.

@@ -106,6 +106,11 @@ pub fn run(args: &Args, job: &Job) -> Result<(), CliError> {
 type Different = Option<(Options, usize)>;
 
 impl Args {
+    /// Whether processes that were started together share the work.
+    pub fn is_shared(&self) -> bool {
+        self.run.share.is_none()
+    }
+
     /// The number of input views, where the arguments go together.
     fn checked_inputs(&self) -> Result<usize, CliError> {
         if self.run.method != MethodName::Model {

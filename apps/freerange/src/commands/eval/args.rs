@@ -172,9 +172,8 @@ impl RunArgs {
 
     /// Opens everything that runs share, and what the objects' numbers depend on.
     pub fn open_shared(&self, device: &Device, job: &Job) -> Result<(Shared, Value), CliError> {
-        let asked = self.share.map(|share| (share.index as usize, share.count as usize));
-        let (index, count) = job.share(asked)?;
-        let share = Share { index: index as u64, count: count as u64 };
+        let (index, count) = job.share();
+        let share = self.share.unwrap_or(Share { index: index as u64, count: count as u64 });
         let source: Source = self.source.open()?;
         let settings = source.settings().clone();
         let config = ScorerConfig {

@@ -45,7 +45,11 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     if let Some(Command::Compare(args)) = &args.command {
         return compare::run(args);
     }
-    let job = Job::start()?;
+    let shared = match &args.command {
+        Some(Command::Ablations(args)) => args.is_shared(),
+        _ => args.run.share.is_none(),
+    };
+    let job = Job::start_if(shared)?;
     let result = match &args.command {
         Some(Command::Ablations(args)) => ablations::run(args, &job),
         _ => evaluate(args, &job),

@@ -156,7 +156,7 @@ impl Prepared {
             ));
         }
         let entries = named(scenes(args)?)?;
-        let (index, count) = job.share(args.share)?;
+        let (index, count) = args.share.unwrap_or(job.share());
         let own: Vec<(usize, Entry)> = entries.into_iter().enumerate().filter(|(i, _)| i % count == index).collect();
         let device = job.open(args.sampling.device)?;
         let model = args.sampling.open(&device)?;
