@@ -26,5 +26,6 @@ for library in mpich ompi; do
     ompi) launch=(mpirun.openmpi --oversubscribe --allow-run-as-root --bind-to none) ;;
   esac
   echo "== ranks with $library"
-  python3 tools/ranks/check.py target/release/freerange "$place/$library" "$kills" "${launch[@]}"
+  cp target/release/freerange "$place/freerange-$library"
+  python3 tools/ranks/check.py "$place/freerange-$library" "$place/$library" "$kills" "${launch[@]}"
 done

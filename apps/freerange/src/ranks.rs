@@ -231,7 +231,7 @@ fn launched(variable: impl Fn(&str) -> Option<String>) -> Option<Launched> {
 /// The ranks that MPI finds; none where this process is alone.
 #[cfg(feature = "mpi")]
 fn connect(launched: &Launched) -> Result<Option<Rc<dyn Ranks>>, CliError> {
-    use freerange_flow::ranks::Mpi;
+    use freerange_mpi::Mpi;
     if !launched.mpi {
         return Err(CliError::input(format!(
             "{} started {} processes without MPI: expected `srun --mpi=pmix` or `--mpi=pmi2`, as the MPI library was built \

@@ -4,8 +4,6 @@
 //! All that ranks say to each other is sums of vectors. What one of them knows alone, it puts into a place of its own in a
 //! vector of zeros.
 
-#[cfg(feature = "mpi")]
-mod mpi;
 mod step;
 #[cfg(test)]
 pub(crate) mod threads;
@@ -15,8 +13,6 @@ use std::fmt;
 use burn::tensor::{Device, Tensor, TensorData};
 
 use crate::FlowError;
-#[cfg(feature = "mpi")]
-pub use mpi::Mpi;
 pub(crate) use step::{Agreed, Layout, Own};
 
 /// How numbers travel between ranks.

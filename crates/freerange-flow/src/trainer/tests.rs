@@ -342,6 +342,14 @@ fn a_batch_may_be_computed_in_parts() {
     assert!(steps("pieces", &config, 4).1 == end);
 }
 
+/// Shards of objects for a configuration, and that with them: they are read in no time.
+fn with_shards(mut config: TrainConfig, place: &Path) -> TrainConfig {
+    let store = Store::local(&place.join("shards"));
+    build(&config.build_config(), &Items::generated(40, 1), &store, &BuildOptions::default(), |_| ()).unwrap();
+    config.data.shards = Some(place.join("shards").to_str().unwrap().into());
+    config
+}
+
 /// Four lanes, two stages with different batches, depths and parts, objects that come and go, validation.
 fn in_lanes() -> TrainConfig {
     let mut config = config();
@@ -392,7 +400,9 @@ fn close(found: &[[f32; 5]], expected: &[[f32; 5]]) {
 #[test]
 fn any_number_of_ranks_trains_the_same() {
     let place = tempfile::tempdir().unwrap();
-    let config = in_lanes();
+    let mut config = in_lanes();
+    config.data.shard.validation = 0.2;
+    let config = with_shards(config, place.path());
     let alone = told(1, &config, &place.path().join("1"), 20).remove(0);
     assert!(alone.0.iter().any(|step| step[0] != alone.0[0][0]) && alone.1.len() == 5);
     for world in [2, 4] {
@@ -430,10 +440,9 @@ fn an_object_that_one_rank_cannot_read_is_left_out_on_all() {
     let path = |name: &str| place.path().join(name);
     let mut config = in_lanes();
     config.validation.every = 0;
-    config.data.shards = Some(path("shards").to_str().unwrap().into());
-    let store = Store::local(&path("shards"));
-    build(&config.build_config(), &Items::generated(40, 1), &store, &BuildOptions::default(), |_| ()).unwrap();
-    let shards = Shards::open(&store, &[3, 4], Some(Split::Train)).unwrap().shuffled_by(config.seed);
+    let config = with_shards(config, place.path());
+    let shards =
+        Shards::open(&Store::local(&path("shards")), &[3, 4], Some(Split::Train)).unwrap().shuffled_by(config.seed);
     let broken = shards.id(13).to_owned();
     let of = |s: &&freerange_data::ShardRecord| s.objects.iter().any(|o| o.id == broken);
     let shard = shards.manifest().shards.iter().find(of).unwrap();

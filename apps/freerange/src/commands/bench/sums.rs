@@ -24,7 +24,11 @@ fn measure(args: &Args, job: &Job) -> Result<(), CliError> {
     let counts = sizes.iter().map(|size| Ok((size.as_str(), numbers(size)?))).collect::<Result<Vec<_>, CliError>>();
     let out = Printer { quiet: !job.first() };
     let hardware = freerange::machine::processor();
-    out.line(&format!("machine: {hardware}, {} processes with {} threads each", job.world(), rayon::current_num_threads()));
+    out.line(&format!(
+        "machine: {hardware}, {} processes with {} threads each",
+        job.world(),
+        rayon::current_num_threads()
+    ));
     out.line(&format!("program: freerange {}, commit {}", env!("CARGO_PKG_VERSION"), runtime::commit()));
     out.line(&format!("command: {}", std::env::args().collect::<Vec<_>>().join(" ")));
     out.header(&["size", "numbers", "wire", "MB", "ms"]);

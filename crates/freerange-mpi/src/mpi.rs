@@ -1,4 +1,4 @@
-//! Ranks that an MPI launcher has started. Whatever the device, sums go through the host's memory.
+//! Whatever the device, sums go through the host's memory.
 
 use std::fmt;
 
@@ -8,8 +8,10 @@ use ferrompi::{Communicator, ReduceOp, ThreadLevel};
 use half::bf16;
 use rayon::prelude::*;
 
-use super::{Ranks, Wire};
-use crate::FlowError;
+use freerange_flow::{
+    FlowError,
+    ranks::{Ranks, Wire},
+};
 
 /// The processes of an `mpirun`, `srun` or the like.
 pub struct Mpi {
