@@ -12,24 +12,40 @@ use freerange_flow::FlowError;
 pub struct CliError {
     source: Box<dyn Error + Send + Sync>,
     code: u8,
+    agreed: bool, // all ranks end with it
 }
 
 impl CliError {
     /// Something that the user gave cannot be used: exit code 2.
     pub fn input(source: impl Into<Box<dyn Error + Send + Sync>>) -> Self {
-        Self { source: source.into(), code: 2 }
+        Self { source: source.into(), code: 2, agreed: false }
     }
 
     /// Something failed through no fault of the user's: exit code 1.
     pub fn failure(source: impl Into<Box<dyn Error + Send + Sync>>) -> Self {
-        Self { source: source.into(), code: 1 }
+        Self { source: source.into(), code: 1, agreed: false }
     }
 
     /// A file could not be read or written: exit code 2, or 1 where the system failed.
     pub fn file(path: &Path, source: impl Into<Box<dyn Error + Send + Sync>>) -> Self {
         let source = source.into();
         let text = format!("{}: {source}", path.display());
-        Self { code: code_of(&*source), source: text.into() }
+        Self { code: code_of(&*source), source: text.into(), agreed: false }
+    }
+
+    /// An error that all ranks end with; one of them says it, the others' text is empty.
+    pub fn agreed(text: String, code: u8) -> Self {
+        Self { source: text.into(), code, agreed: true }
+    }
+
+    /// Whether all ranks end with it.
+    pub fn is_agreed(&self) -> bool {
+        self.agreed
+    }
+
+    /// The error itself.
+    pub fn cause(&self) -> &(dyn Error + Send + Sync + 'static) {
+        &*self.source
     }
 
     /// What the process ends with.
@@ -97,8 +113,12 @@ impl From<FlowError> for CliError {
         match e {
             FlowError::Data(e) => e.into(),
             FlowError::Build(e) => e.into(),
-            FlowError::NotFinite { .. } | FlowError::NoGradient | FlowError::Cancelled => Self::failure(e),
-            _ => Self { code: code_of(&e), source: e.into() },
+            FlowError::NotFinite { .. }
+            | FlowError::NoGradient
+            | FlowError::Cancelled
+            | FlowError::Ranks { .. }
+            | FlowError::Elsewhere { .. } => Self::failure(e),
+            _ => Self { code: code_of(&e), source: e.into(), agreed: false },
         }
     }
 }
@@ -110,7 +130,7 @@ impl From<freerange::Error> for CliError {
             E::Flow(e) => e.into(),
             E::Fit(e) => e.into(),
             E::Cancelled | E::BrokenDevice(_) => Self::failure(e),
-            _ => Self { code: code_of(&e), source: e.into() },
+            _ => Self { code: code_of(&e), source: e.into(), agreed: false },
         }
     }
 }
@@ -121,9 +141,9 @@ impl From<DataError> for CliError {
             DataError::Worker { .. } => Self::failure(e),
             DataError::Source(e) => match e.downcast::<BuildError>() {
                 Ok(e) => (*e).into(),
-                Err(e) => Self { code: code_of(&*e), source: e },
+                Err(e) => Self { code: code_of(&*e), source: e, agreed: false },
             },
-            _ => Self { code: code_of(&e), source: e.into() },
+            _ => Self { code: code_of(&e), source: e.into(), agreed: false },
         }
     }
 }
@@ -133,7 +153,7 @@ impl From<BuildError> for CliError {
         match e {
             BuildError::Data(e) => e.into(),
             BuildError::Fit(e) => e.into(),
-            _ => Self { code: code_of(&e), source: e.into() },
+            _ => Self { code: code_of(&e), source: e.into(), agreed: false },
         }
     }
 }
@@ -143,7 +163,7 @@ impl From<FitError> for CliError {
         match e {
             // A loss that stops being a number is no fault of what the user gave.
             FitError::Diverged { .. } => Self::failure(e),
-            _ => Self { code: code_of(&e), source: e.into() },
+            _ => Self { code: code_of(&e), source: e.into(), agreed: false },
         }
     }
 }
@@ -152,7 +172,7 @@ macro_rules! other_errors {
     ($($error:ty),*) => {$(
         impl From<$error> for CliError {
             fn from(e: $error) -> Self {
-                Self { code: code_of(&e), source: e.into() }
+                Self { code: code_of(&e), source: e.into(), agreed: false }
             }
         }
     )*};

@@ -5,6 +5,7 @@ mod error;
 mod output;
 mod photos;
 mod progress;
+mod ranks;
 mod runtime;
 
 use std::process::ExitCode;
@@ -93,7 +94,11 @@ fn main() -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {
-            eprintln!("error: {e}");
+            let text = e.to_string();
+            // Another rank says it.
+            if !text.is_empty() {
+                eprintln!("error: {text}");
+            }
             ExitCode::from(e.exit_code())
         }
     }

@@ -56,6 +56,8 @@ const ROOMS: &[(&str, &[&str])] = &[
             "freerange-build",
         ],
     ),
+    // Apart from the training it serves, so that an MPI library can be changed without compiling that again.
+    ("freerange-mpi", &["freerange-flow"]),
     (
         "freerange",
         &[

@@ -18,14 +18,15 @@ pub trait ObjectSource: Send + Sync {
     }
 }
 
-/// Objects `first`, `first + 1`, ... of a source, in order, made by `workers` threads that stay a little ahead.
+/// Objects `first`, `first + 1`, ... of a source, in order, or every so many of them, made by threads that stay a little ahead.
 ///
 /// Objects that cannot be read are left out, as long as they are few.
 #[derive(Debug)]
 pub struct Stream {
     queues: Vec<Receiver<Result<Object, DataError>>>,
     first: u64,
-    next: u64, // counted from `first`
+    stride: u64,
+    next: u64, // counted from `first`, in strides
     broken: Vec<u64>,
 }
 
@@ -37,15 +38,22 @@ impl Stream {
     /// One unreadable object in so many is too few to stop for.
     const READ_PER_BROKEN: u64 = 100;
 
-    /// Starts the threads. They end when the stream is dropped.
+    /// Starts `workers` threads. They end when the stream is dropped.
     pub fn start(source: Arc<dyn ObjectSource>, first: u64, workers: usize) -> Self {
-        let workers = workers.max(1);
+        Self::one_of(1, source, first, 1, workers)
+    }
+
+    /// One of `streams` that share memory and `workers` threads, of which each has one at least: it has objects `first`,
+    /// `first + stride`, and so on.
+    pub fn one_of(streams: usize, source: Arc<dyn ObjectSource>, first: u64, stride: u64, workers: usize) -> Self {
+        let workers = (workers / streams).max(1);
+        let ahead = (Self::AHEAD / streams).max(1);
         let queues = (0..workers as u64).map(|worker| {
-            let (sender, receiver) = bounded(Self::AHEAD);
+            let (sender, receiver) = bounded(ahead);
             let source = source.clone();
             thread::spawn(move || {
                 // Thread k makes every `workers`-th object, so that the order does not depend on who is faster.
-                for index in (first + worker..).step_by(workers) {
+                for index in (first + stride * worker..).step_by(stride as usize * workers) {
                     if sender.send(source.object(index)).is_err() {
                         return; // nobody listens any more
                     }
@@ -53,7 +61,7 @@ impl Stream {
             });
             receiver
         });
-        Self { queues: queues.collect(), first, next: 0, broken: Vec::new() }
+        Self { queues: queues.collect(), first, stride, next: 0, broken: Vec::new() }
     }
 
     /// The next object that can be read, and its number. Waits for it if need be.
@@ -62,7 +70,7 @@ impl Stream {
     /// [`DataError::TooManyBroken`]; [`DataError::Worker`] where a thread has died.
     pub fn take_next(&mut self) -> Result<(u64, Object), DataError> {
         loop {
-            let index = self.first + self.next;
+            let index = self.first + self.stride * self.next;
             let queue = &self.queues[(self.next % self.queues.len() as u64) as usize];
             self.next += 1;
             let problem = match queue.recv() {
@@ -115,6 +123,17 @@ mod tests {
             assert_eq!(taken, [4, 7, 8, 10].map(|i: u64| (i, i.to_string())));
             assert_eq!(stream.broken(), [5, 6, 9]);
         }
+    }
+
+    #[test]
+    fn lanes_together_have_every_object() {
+        let mut lanes =
+            [0, 1, 2].map(|lane| Stream::one_of(3, Arc::new(Some(|i| i == 7)), 3 + lane, 3, 1 + 3 * lane as usize));
+        let mut taken: Vec<u64> = lanes.iter_mut().flat_map(|s| [(); 4].map(|()| s.take_next().unwrap().0)).collect();
+        assert_eq!(taken[4..8], [4, 10, 13, 16]);
+        assert_eq!(lanes[1].broken(), [7]);
+        taken.sort();
+        assert_eq!(taken, [3, 4, 5, 6, 8, 9, 10, 11, 12, 13, 14, 16]);
     }
 
     #[test]

@@ -9,6 +9,7 @@ use crate::{
     FlowError, ValidationConfig,
     coupling::Coupling,
     path::TimeSchedule,
+    ranks::Wire,
     sample::{GradientAt, SampleConfig},
 };
 
@@ -66,6 +67,10 @@ pub struct DataConfig {
     pub fresh: usize,
     /// Threads that make or read objects beside training.
     pub workers: usize,
+    /// Object number i belongs to lane i mod `lanes`, and each lane has its share of window, fresh objects and batch: whoever
+    /// trains with as many processes as divide it trains the same, and each reads the objects of its own lanes only.
+    #[serde(skip_serializing_if = "is_one")]
+    pub lanes: usize,
     /// Objects over which the normalisation statistics are measured before training.
     pub statistics_objects: usize,
 }
@@ -83,6 +88,7 @@ impl Default for DataConfig {
             window: 64,
             fresh: 2,
             workers: 1,
+            lanes: 1,
             statistics_objects: 256,
         }
     }
@@ -166,6 +172,14 @@ pub struct StartLoss {
     pub render: Option<f32>,
 }
 
+fn is_one(x: &usize) -> bool {
+    *x == 1
+}
+
+fn is_f32(wire: &Wire) -> bool {
+    *wire == Wire::F32
+}
+
 fn one() -> f32 {
     1.0
 }
@@ -230,6 +244,9 @@ pub struct OptimizerConfig {
     pub ema: f32,
     /// Arithmetic of the blocks, `f32`, `bf16` or `auto`, the faster on this device; weights and sums stay in 32 bits.
     pub compute: Compute,
+    /// How gradients travel between ranks: `f32`, or `bf16` for half of the bytes.
+    #[serde(skip_serializing_if = "is_f32")]
+    pub wire: Wire,
     /// Keep only the input of each block, and compute the block again for its gradient: a fraction of the memory for a
     /// third more work.
     pub recompute: bool,
@@ -248,6 +265,7 @@ impl Default for OptimizerConfig {
             clip: 1.0,
             ema: 0.9999,
             compute: Compute::F32,
+            wire: Wire::F32,
             recompute: false,
         }
     }
@@ -324,9 +342,9 @@ impl Stage {
         self.micro_batch.unwrap_or(self.batch)
     }
 
-    /// How many times a step computes.
-    pub fn parts(&self) -> usize {
-        self.batch.div_ceil(self.at_a_time())
+    /// How many times a step computes for each of `lanes` lanes, which divide the batch.
+    pub fn parts_per_lane(&self, lanes: usize) -> usize {
+        (self.batch / lanes).div_ceil(self.at_a_time())
     }
 }
 
@@ -499,6 +517,15 @@ impl TrainConfig {
         check(o.clip > 0.0, "optimizer.clip", "above 0", o.clip.to_string())?;
         // Nothing scales the loss here, and without that the gradients of many weights round to zero.
         check(o.compute != Compute::F16, "optimizer.compute", "\"f32\" or \"bf16\"", "\"f16\"".into())?;
+        let lanes = self.data.lanes;
+        check((1..=4096).contains(&lanes), "data.lanes", "1 to 4096", lanes.to_string())?;
+        let of_lanes = format!("a multiple of data.lanes, {lanes}");
+        for (field, value) in [("data.window", self.data.window), ("data.fresh", self.data.fresh)] {
+            check(value.is_multiple_of(lanes), field, &of_lanes, value.to_string())?;
+        }
+        for s in &self.stages {
+            check(s.batch.is_multiple_of(lanes), "stage.batch", &of_lanes, s.batch.to_string())?;
+        }
         check(self.data.window > 0, "data.window", "at least 1", self.data.window.to_string())?;
         check(self.data.workers > 0, "data.workers", "at least 1", self.data.workers.to_string())?;
         check(self.data.statistics_objects > 0, "data.statistics_objects", "at least 1", "0".into())?;

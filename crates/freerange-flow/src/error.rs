@@ -68,6 +68,30 @@ pub enum FlowError {
         /// The reason.
         source: std::io::Error,
     },
+    /// Processes that train together could not speak with each other.
+    #[error("ranks: {problem}")]
+    Ranks {
+        /// What is wrong.
+        problem: String,
+    },
+    /// Another process of those that train together has failed, and says why.
+    #[error("rank {rank} has failed")]
+    Elsewhere {
+        /// Its number.
+        rank: usize,
+    },
+    /// Processes that train together are not of one kind, or have come apart.
+    #[error("rank {rank}: {what}: expected {expected} as on rank 0, found {found}")]
+    Differs {
+        /// The one that differs from rank 0.
+        rank: usize,
+        /// What differs.
+        what: String,
+        /// What it is on rank 0.
+        expected: String,
+        /// What it is there.
+        found: String,
+    },
     /// The caller asked to stop.
     #[error("cancelled")]
     Cancelled,

@@ -11,6 +11,7 @@ pub mod log;
 mod optimizer;
 pub mod path;
 pub mod photometric;
+pub mod ranks;
 pub mod sample;
 pub mod train;
 pub mod trainer;

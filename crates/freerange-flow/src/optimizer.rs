@@ -19,6 +19,7 @@ use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 use crate::{
     FlowError,
     config::{Decay, OptimizerConfig},
+    ranks::{Ranks, from_first, tensor_of_first},
     weights::Weights,
 };
 
@@ -29,7 +30,7 @@ const PIECE: usize = 1 << 14;
 
 /// The gradient of each of a module's parameters in the order in which the module visits them, flat; none where none
 /// reached it.
-pub(crate) struct Flat(Vec<Option<Tensor<1>>>);
+pub(crate) struct Flat(pub Vec<Option<Tensor<1>>>);
 
 impl Flat {
     pub fn of<M: Module>(gradients: &mut Gradients, module: &M) -> Self {
@@ -143,6 +144,22 @@ impl AdamW {
     /// For a module of so many parameters.
     pub fn new(parameters: usize) -> Self {
         Self { moments: vec![None; parameters] }
+    }
+
+    /// The state of rank 0, on every rank.
+    pub fn follow_first(&mut self, ranks: &dyn Ranks, weights: &Weights) -> Result<(), FlowError> {
+        let present: Vec<u8> = self.moments.iter().map(|m| m.is_some().into()).collect();
+        let present = from_first(ranks, &present)?;
+        for ((moments, present), w) in self.moments.iter_mut().zip(present).zip(&weights.0) {
+            *moments = match (moments.take(), present) {
+                (_, 0) => None,
+                (own, _) => {
+                    let [m, v] = own.unwrap_or_else(|| [w.zeros_like(), w.zeros_like()]);
+                    Some([tensor_of_first(ranks, m)?, tensor_of_first(ranks, v)?])
+                }
+            };
+        }
+        Ok(())
     }
 
     /// The module after a step, which `average` follows. A module of which there is no other copy is changed in place.

@@ -3,6 +3,7 @@
 use std::{
     collections::VecDeque,
     path::{Path, PathBuf},
+    rc::Rc,
     sync::Arc,
     time::Instant,
 };
@@ -13,7 +14,7 @@ use burn::{
     tensor::{Device, Tensor},
 };
 use freerange_build::Generated;
-use freerange_core::{sync_folder, sync_tree};
+use freerange_core::{sha256, sync_folder, sync_tree};
 use freerange_data::{Object, ObjectSource, Shards, Split, Store, Stream};
 use freerange_model::{Checkpoint, Compute, Dinov2, EncoderConfig, FreeRange, ModelConfig, WeightsOrigin};
 use freerange_splat::{Normalization, Statistics, channel};
@@ -22,15 +23,18 @@ use rand::seq::index::sample as sample_indices;
 use crate::{
     FlowError,
     batch::{Batch, part_rng, step_rng},
-    config::TrainConfig,
+    config::{DataConfig, Stage, TrainConfig},
     inherit::is_path,
     optimizer::{AdamW, Flat, Step},
     photometric::Photometric,
+    ranks::{Agreed, Layout, Own, Ranks, Single, agree, from_first, same_on_all, tensor_of_first},
     train,
     validation::{Figures, Validation},
     weights::Weights,
 };
 
+/// Losses that are told of a step.
+const LOSSES: usize = 4;
 /// Decay of the running mean square of the photometric gradient.
 const GRADIENT_STATISTIC_DECAY: f32 = 0.99;
 /// Steps in a row whose loss or gradients are not finite that end a run. Fewer are left out: a batch may be bad, a model
@@ -62,6 +66,25 @@ pub struct StepReport {
     pub skipped: u64,
     /// Objects so far that could not be read.
     pub broken: u64,
+    /// Seconds that each of several ranks had worked when it began to wait for the others.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub rank_seconds: Vec<f32>,
+    /// Seconds that this rank of several spent on the sum, its wait for the slowest included.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub sum_seconds: Option<f64>,
+    /// Whether [`Trainer::stop_at`] has come, on any rank.
+    #[serde(skip)]
+    pub out_of_time: bool,
+}
+
+impl StepReport {
+    /// The rank that the others waited for, and for how many seconds they did on average; none of a single rank.
+    pub fn slowest(&self) -> Option<(usize, f32)> {
+        let (rank, most) = self.rank_seconds.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1))?;
+        let others = self.rank_seconds.len().checked_sub(1).filter(|&n| n > 0)?;
+        let waited: f32 = self.rank_seconds.iter().map(|s| most - s).sum();
+        Some((rank, waited / others as f32))
+    }
 }
 
 /// What is reported after a measurement on objects that training does not see.
@@ -96,9 +119,12 @@ struct Progress {
     #[serde(default)]
     inherited: bool,
     normalization: Normalization,
-    /// Number of the first object of the window that the next batch is drawn from.
+    /// Number of the first object of the window that the next batch is drawn from; none where there are several lanes.
     #[serde(default)]
     first_object: Option<u64>,
+    /// That number in each of several lanes.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    first_objects: Vec<u64>,
     /// Objects before it that could not be read.
     #[serde(default)]
     broken: u64,
@@ -111,6 +137,27 @@ struct Progress {
     /// The frozen encoder's weights; none of an encoder of its own, or of random ones.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     encoder: Option<WeightsOrigin>,
+}
+
+impl Progress {
+    /// Of each lane, the number of the first object of its window.
+    fn positions(&self, data: &DataConfig) -> Result<Vec<u64>, String> {
+        match (data.lanes, self.first_objects.len()) {
+            (1, 0) => Ok(vec![self.first_object.unwrap_or(self.step * data.fresh as u64)]),
+            (lanes, 0) if self.step == 0 => Ok((0..lanes as u64).collect()),
+            (lanes, found) if lanes == found => Ok(self.first_objects.clone()),
+            (lanes, found) => {
+                Err(format!("first_objects: expected {lanes}, one for each of data.lanes, found {found}"))
+            }
+        }
+    }
+
+    fn set_positions(&mut self, positions: Vec<u64>) {
+        match positions[..] {
+            [only] => self.first_object = Some(only),
+            _ => (self.first_object, self.first_objects) = (None, positions),
+        }
+    }
 }
 
 /// Published weights of a frozen encoder.
@@ -132,6 +179,57 @@ pub struct Initial<'a> {
     pub remeasure: bool,
 }
 
+/// The processes that share a run.
+#[derive(Clone)]
+pub struct Among {
+    /// All of them.
+    pub ranks: Rc<dyn Ranks>,
+    /// Names and values of what has to be the same on all ranks, besides configuration, data and encoder: such as the program.
+    pub identity: Vec<(String, String)>,
+}
+
+impl Among {
+    /// One process alone.
+    pub fn single() -> Self {
+        Self { ranks: Rc::new(Single), identity: Vec::new() }
+    }
+}
+
+/// The objects of a lane that this rank works on.
+struct Lane {
+    number: usize,
+    stream: Stream,
+    window: VecDeque<(u64, Arc<Object>)>, // with their numbers
+}
+
+impl Lane {
+    fn first(&self) -> u64 {
+        self.window.front().map_or(0, |(number, _)| *number)
+    }
+}
+
+/// What the objects of this rank gave in a step.
+struct Computed {
+    gradients: Flat,
+    figures: Tensor<1>, // the losses, and the mean squares of the photometric gradient
+    positions: Vec<(usize, u64)>,
+    data_seconds: f64,
+}
+
+/// What the objects of all ranks gave.
+struct Summed {
+    gradients: Flat,
+    figures: Vec<f32>, // the norm of the gradients, and as in `Computed`
+    agreed: Agreed,
+    data_seconds: f64, // of this rank
+    sum_seconds: Option<f64>,
+}
+
+/// The values of a tensor that is small.
+fn numbers(t: Tensor<1>) -> Result<Vec<f32>, FlowError> {
+    t.into_data().try_to_vec::<f32>().map_err(|_| FlowError::NoGradient)
+}
+
 /// A training run in memory.
 pub struct Trainer {
     config: TrainConfig,
@@ -142,9 +240,10 @@ pub struct Trainer {
     optimizer: AdamW,
     progress: Progress,
     photometric: Photometric,
-    stream: Stream,
-    broken: u64,                             // objects before those of the stream that could not be read
-    window: VecDeque<(u64, Arc<Object>)>,    // with their numbers
+    ranks: Rc<dyn Ranks>,
+    lanes: Vec<Lane>, // of this rank
+    broken: u64,      // objects before those of all streams that could not be read
+    stop_at: Option<Instant>,
     ahead: Option<Result<Batch, FlowError>>, // of the next step
     not_finite: u32,                         // steps in a row
     validation: Option<Validation>,
@@ -178,46 +277,75 @@ impl Trainer {
         initial: Option<Initial>,
         encoder: Option<&EncoderWeights>,
         device: &Device,
+        progress: impl FnMut(&str),
+    ) -> Result<Self, FlowError> {
+        Self::open_among(Among::single(), config, folder, initial, encoder, device, progress)
+    }
+
+    /// [`open_with`](Self::open_with) on several ranks, all of which must call it. Only rank 0 reads and writes the folder, and
+    /// only its `initial` matters.
+    ///
+    /// # Errors
+    /// As [`open`](Self::open); [`FlowError::Differs`]; [`FlowError::Elsewhere`] where another rank has one of these.
+    pub fn open_among(
+        among: Among,
+        config: TrainConfig,
+        folder: &Path,
+        initial: Option<Initial>,
+        encoder: Option<&EncoderWeights>,
+        device: &Device,
         mut progress: impl FnMut(&str),
     ) -> Result<Self, FlowError> {
-        config.validate()?;
+        let Among { ranks: among_ranks, identity } = among;
+        let ranks = &*among_ranks;
+        let (rank, world) = (ranks.rank(), ranks.world());
         let plain = device.clone().inner();
         let tracked = plain.clone().autodiff();
-        // Where nothing is differentiated, and features are those of sampling to the bit.
-        let encoder = load_encoder(&config.model.encoder, encoder, &plain, &mut progress)?;
-        let origin = encoder.as_ref().and_then(|e| e.origin().cloned());
-        if let Some(Initial { checkpoint, .. }) = initial {
-            require_same_model(&config.model, &checkpoint.config)?;
-            let theirs = checkpoint.model.encoder().dinov2().and_then(Dinov2::origin);
-            require_same_encoder(theirs, origin.as_ref(), || "the initial checkpoint".into())?;
+        let prepared = agree(ranks, Prepared::new(&config, initial, encoder, [rank, world], &plain, &mut progress))?;
+        let Prepared { source, validation, encoder, origin, manifest } = prepared;
+        if world > 1 {
+            let encoder = origin.as_ref().map_or("none".into(), |origin| origin.sha256.clone());
+            let own = [("configuration", fingerprint(&config)), ("data", manifest), ("encoder weights", encoder)];
+            let own = own.map(|(what, value)| (what.to_owned(), value));
+            same_on_all(ranks, &[identity, own.to_vec()].concat())?;
         }
-        let source = training_objects(&config)?;
-        let validation = validation_objects(&config)?;
-        // Not before the data are there: a folder that holds a configuration belongs to a run.
-        std::fs::create_dir_all(folder).map_err(|source| FlowError::Io { path: folder.into(), source })?;
-        check_same_run(&config, folder)?;
-        let mut model = FreeRange::new(&config.model, &mut step_rng(config.seed, u64::MAX), &tracked)?;
-        if let Some(encoder) = encoder {
-            model = model.with_dinov2(&config.model, encoder)?;
-        }
-        // States and averages are of what is trained.
-        let (model, frozen) =
-            model.with_compute(config.optimizer.compute).with_recompute(config.optimizer.recompute).take_dinov2();
-        let State { model, average, optimizer, progress: state } = match latest_state(folder)? {
+        let compute = compute_of_first(ranks, config.optimizer.compute, &plain)?;
+        let own_folder = || {
+            // Not before the data are there: a folder that holds a configuration belongs to a run.
+            std::fs::create_dir_all(folder).map_err(|source| FlowError::Io { path: folder.into(), source })?;
+            check_same_run(&config, folder)
+        };
+        agree(ranks, if rank == 0 { own_folder() } else { Ok(()) })?;
+        let model = || {
+            let mut model = FreeRange::new(&config.model, &mut step_rng(config.seed, u64::MAX), &tracked)?;
+            if let Some(encoder) = encoder {
+                model = model.with_dinov2(&config.model, encoder)?;
+            }
+            // States and averages are of what is trained.
+            Ok(model.with_compute(compute).with_recompute(config.optimizer.recompute).take_dinov2())
+        };
+        let (model, frozen) = agree(ranks, model())?;
+        let begin = || match latest_state(folder)? {
             Some(path) => {
                 progress(&format!("continuing from {}", path.display()));
-                State::load(&path, model, origin.as_ref(), &plain)?
+                State::load(&path, model.clone(), origin.as_ref(), &plain)
             }
             None => {
                 let normalization = normalization(&config, initial, source.as_ref(), &mut progress)?;
-                State::begin(model, initial, normalization, origin)
+                Ok(State::begin(model.clone(), initial, normalization, origin))
             }
         };
-        let first = state.first_object.unwrap_or(state.step * config.data.fresh as u64);
-        let mut stream = Stream::start(source, first, config.data.workers);
+        let state = agree(ranks, if rank == 0 { begin().map(Some) } else { Ok(None) })?;
+        let State { model, average, optimizer, progress: mut state } = match state {
+            Some(state) if world == 1 => state,
+            state => State::of_first(ranks, state, model)?,
+        };
+        let positions = state
+            .positions(&config.data)
+            .map_err(|problem| FlowError::State { path: folder.join("progress.json"), problem })?;
         progress(&format!("filling the window with {} objects", config.data.window));
-        let window = (0..config.data.window).map(|_| stream.take_next().map(|(i, object)| (i, Arc::new(object))));
-        let window = window.collect::<Result<VecDeque<_>, _>>()?;
+        let lanes = agree(ranks, lanes(&config.data, &positions, [rank, world], &source))?;
+        state.set_positions(positions);
         Ok(Self {
             photometric: Photometric::new(&state.normalization, &plain),
             config,
@@ -227,14 +355,20 @@ impl Trainer {
             average,
             optimizer,
             broken: state.broken,
-            progress: Progress { first_object: Some(first), ..state },
-            stream,
-            window,
+            progress: state,
+            ranks: among_ranks,
+            lanes,
+            stop_at: None,
             ahead: None,
             not_finite: 0,
             validation,
             folder: folder.into(),
         })
+    }
+
+    /// Steps after this time report that it is over, on all ranks alike.
+    pub fn stop_at(&mut self, time: Instant) {
+        self.stop_at = Some(time);
     }
 
     /// Steps taken so far.
@@ -251,46 +385,51 @@ impl Trainer {
         self.model.as_ref().expect("a step gives it back")
     }
 
-    /// Part `part` of the batch of step `index`, which must be the first or follow the one before.
+    /// The parts of a step's batch that this rank computes: those of its lanes, one lane after the other.
+    fn own_parts(&self, stage: &Stage) -> Vec<usize> {
+        let count = stage.parts_per_lane(self.config.data.lanes);
+        self.lanes.iter().flat_map(|lane| lane.number * count..(lane.number + 1) * count).collect()
+    }
+
+    /// Part `part` of the batch of step `index`, which must be this rank's first or follow the one before.
     fn draw(&mut self, index: u64, part: usize) -> Result<Batch, FlowError> {
-        let stage = self.config.stage(index);
-        let mut rng = step_rng(self.config.seed, index);
-        let count = self.window.len();
-        let chosen: Vec<Arc<Object>> = match stage.batch <= count {
-            true => {
-                sample_indices(&mut rng, count, stage.batch).into_iter().map(|i| self.window[i].1.clone()).collect()
-            }
-            false => (0..stage.batch).map(|i| self.window[i % count].1.clone()).collect(),
+        let (stage, data) = (self.config.stage(index), &self.config.data);
+        let per_lane = stage.parts_per_lane(data.lanes);
+        let (lane, chunk) = (part / per_lane, part % per_lane);
+        let lane = self.lanes.iter_mut().find(|l| l.number == lane).expect("a lane of this rank");
+        // Which objects the lane takes is drawn where its first part draws the rest.
+        let mut rng = part_rng(step_rng(self.config.seed, index), part - chunk);
+        let (count, batch) = (lane.window.len(), stage.batch / data.lanes);
+        let chosen: Vec<Arc<Object>> = match batch <= count {
+            true => sample_indices(&mut rng, count, batch).into_iter().map(|i| lane.window[i].1.clone()).collect(),
+            false => (0..batch).map(|i| lane.window[i % count].1.clone()).collect(),
         };
-        let chosen = chosen.chunks(stage.at_a_time()).nth(part).expect("a part of the batch");
+        let chosen = chosen.chunks(stage.at_a_time()).nth(chunk).expect("a part of the batch");
         let model_config = ModelConfig { image_size: stage.image_size, ..self.config.model.clone() };
         let loss = &self.config.loss;
-        let mut rng = part_rng(rng, part);
+        let mut rng = if chunk > 0 { part_rng(rng, part) } else { rng };
         let batch =
             Batch::draw(chosen, stage, &model_config, loss, &self.progress.normalization, &mut rng, &self.device)?;
-        if part + 1 == stage.parts() {
-            for _ in 0..self.config.data.fresh {
-                let (i, object) = self.stream.take_next()?;
-                self.window.push_back((i, Arc::new(object)));
-                self.window.pop_front();
+        if chunk + 1 == per_lane {
+            for _ in 0..data.fresh / data.lanes {
+                let (i, object) = lane.stream.take_next()?;
+                lane.window.push_back((i, Arc::new(object)));
+                lane.window.pop_front();
             }
         }
         Ok(batch)
     }
 
-    /// Takes one step. A step whose loss or gradients are not finite changes no weights.
-    ///
-    /// After an error, too, [`save`](Self::save) keeps what was reached before it.
-    pub fn step(&mut self) -> Result<StepReport, FlowError> {
-        let begin = Instant::now();
-        let index = self.progress.step;
-        let (stage, total_steps) = (self.config.stage(index).clone(), self.config.total_steps());
+    /// Gradients and figures of this rank's objects in step `index`: means over the parts, each by its share of the batch.
+    fn compute(&mut self, index: u64) -> Result<Computed, FlowError> {
+        let stage = self.config.stage(index).clone();
+        let parts = self.own_parts(&stage);
+        let all_parts = stage.parts_per_lane(self.config.data.lanes) * self.config.data.lanes;
         let mut data_seconds = 0.0;
         let rms = Tensor::<1>::from_floats(self.gradient_rms(), &self.device).reshape([1, 1, channel::COUNT]);
-        // Of the step: means over its parts, each by its share of the objects.
         let mut sums: Option<(Flat, Tensor<1>)> = None;
-        let mut first_object = None;
-        for part in 0..stage.parts() {
+        let mut positions = Vec::new();
+        for (i, &part) in parts.iter().enumerate() {
             let begin = Instant::now();
             let batch = match self.ahead.take() {
                 Some(batch) => batch?,
@@ -305,7 +444,7 @@ impl Trainer {
             let mut figures = vec![losses.total.clone().inner(), losses.flow, losses.seen, losses.held];
             figures.extend(losses.gradient_square);
             let (mut total, mut figures) = (losses.total, Tensor::cat(figures, 0));
-            if stage.parts() > 1 {
+            if all_parts > 1 {
                 (total, figures) = (total.mul_scalar(share), figures.mul_scalar(share));
             }
             let gradients = Flat::of(&mut total.backward(), self.model());
@@ -315,21 +454,110 @@ impl Trainer {
             });
             // A GPU has only been told by now what to do: the next objects are made ready while it works.
             let begin = Instant::now();
-            if part + 1 < stage.parts() {
-                self.ahead = Some(self.draw(index, part + 1));
-            } else {
-                first_object = self.window.front().map(|(number, _)| *number);
-                if index + 1 < total_steps {
-                    self.ahead = Some(self.draw(index + 1, 0));
+            match parts.get(i + 1) {
+                Some(&next) => self.ahead = Some(self.draw(index, next)),
+                None => {
+                    positions = self.lanes.iter().map(|lane| (lane.number, lane.first())).collect();
+                    if index + 1 < self.config.total_steps() {
+                        let next = self.own_parts(self.config.stage(index + 1))[0];
+                        self.ahead = Some(self.draw(index + 1, next));
+                    }
                 }
             }
             data_seconds += begin.elapsed().as_secs_f64();
         }
-        let (mut gradients, figures) = sums.expect("a batch has a part");
-        let norm = gradients.norm(&self.device);
+        let (gradients, figures) = sums.expect("a batch has a part");
+        Ok(Computed { gradients, figures, positions, data_seconds })
+    }
+
+    /// Objects of this rank's lanes that could not be read: before `positions`, and in all.
+    fn unreadable(&self, positions: &[(usize, u64)]) -> [u64; 2] {
+        let behind = |lane: &Lane| {
+            let first = positions.iter().find(|(number, _)| *number == lane.number).map(|(_, first)| *first);
+            lane.stream.broken().iter().filter(|&&number| Some(number) < first).count() as u64
+        };
+        let all = |lane: &Lane| lane.stream.broken().len() as u64;
+        [self.lanes.iter().map(behind).sum(), self.lanes.iter().map(all).sum()]
+    }
+
+    fn out_of_time(&self) -> bool {
+        self.stop_at.is_some_and(|time| Instant::now() >= time)
+    }
+
+    /// The step of a single rank.
+    fn alone(&self, computed: Computed) -> Result<Summed, FlowError> {
+        let Computed { mut gradients, figures, positions, data_seconds } = computed;
         // One transfer for all figures: each would wait for the device.
-        let figures =
-            Tensor::cat(vec![norm, figures], 0).into_data().try_to_vec::<f32>().map_err(|_| FlowError::NoGradient)?;
+        let figures = numbers(Tensor::cat(vec![gradients.norm(&self.device), figures], 0))?;
+        let agreed = Agreed {
+            present: Vec::new(),
+            seconds: Vec::new(),
+            broken: self.unreadable(&positions),
+            positions: positions.into_iter().map(|(_, first)| first).collect(),
+            stop: false,
+            failed: None,
+        };
+        Ok(Summed { gradients, figures, agreed, data_seconds, sum_seconds: None })
+    }
+
+    /// The step of all ranks, from what this one has computed since `begin`, or why it could not.
+    fn summed(&self, computed: Result<Computed, FlowError>, begin: Instant) -> Result<Summed, FlowError> {
+        let ranks = &*self.ranks;
+        let layout = Layout {
+            parameters: self.average.0.iter().map(|w| w.dims()[0]).collect(),
+            figures: LOSSES + if self.model().dit().gradient_channels() { channel::COUNT } else { 0 },
+            world: ranks.world(),
+            lanes: self.config.data.lanes,
+        };
+        let computed = computed.and_then(|computed| {
+            // Else a device would seem fast that has only been told what to do.
+            let synced = self.device.sync();
+            synced.map(|()| computed).map_err(|e| FlowError::Ranks { problem: format!("the device failed: {e}") })
+        });
+        let (computed, failure) = match computed {
+            Ok(computed) => (Some(computed), None),
+            Err(e) => (None, Some(e)),
+        };
+        let (data_seconds, positions) =
+            computed.as_ref().map_or_else(Default::default, |c| (c.data_seconds, c.positions.clone()));
+        let own = Own {
+            broken: self.unreadable(&positions),
+            positions,
+            stop: self.out_of_time(),
+            found: computed.map(|c| (c.gradients, c.figures)),
+            seconds: begin.elapsed().as_secs_f64(),
+        };
+        let summing = Instant::now();
+        let (mut gradients, tail) = layout.sum(ranks, own, self.config.optimizer.wire, &self.device)?;
+        let mut figures = numbers(Tensor::cat(vec![gradients.norm(&self.device), tail], 0))?;
+        let sum_seconds = summing.elapsed().as_secs_f64();
+        let agreed = layout.read(&figures.split_off(1 + layout.figures));
+        match (failure, agreed.failed) {
+            (Some(e), _) => return Err(e),
+            (None, Some(rank)) => return Err(FlowError::Elsewhere { rank }),
+            (None, None) => {}
+        }
+        for (gradient, _) in gradients.0.iter_mut().zip(&agreed.present).filter(|(_, present)| !**present) {
+            *gradient = None;
+        }
+        Ok(Summed { gradients, figures, agreed, data_seconds, sum_seconds: Some(sum_seconds) })
+    }
+
+    /// Takes one step. A step whose loss or gradients are not finite changes no weights.
+    ///
+    /// After an error, too, [`save`](Self::save) keeps what was reached before it. Where one rank cannot take it, none does.
+    ///
+    /// # Errors
+    /// [`FlowError::NotFinite`], on all ranks; those of data and device; [`FlowError::Elsewhere`]; [`FlowError::Ranks`].
+    pub fn step(&mut self) -> Result<StepReport, FlowError> {
+        let begin = Instant::now();
+        let index = self.progress.step;
+        let total_steps = self.config.total_steps();
+        let computed = self.compute(index);
+        let Summed { gradients, figures, agreed, data_seconds, sum_seconds } = match self.ranks.world() {
+            1 => self.alone(computed?)?,
+            _ => self.summed(computed, begin)?,
+        };
         let (&[norm, total, flow, seen, held], square) = figures.split_first_chunk().ok_or(FlowError::NoGradient)?;
         let o = &self.config.optimizer;
         let rate = o.rate(index, total_steps);
@@ -352,9 +580,8 @@ impl Trainer {
         p.step += 1;
         p.seconds += seconds;
         p.skipped += u64::from(!finite);
-        p.first_object = first_object;
-        p.broken =
-            self.broken + self.stream.broken().iter().filter(|&&number| Some(number) < first_object).count() as u64;
+        p.set_positions(agreed.positions);
+        p.broken = self.broken + agreed.broken[0];
         self.not_finite = if finite { 0 } else { self.not_finite + 1 };
         if self.not_finite == NOT_FINITE_IN_A_ROW {
             return Err(FlowError::NotFinite { steps: self.not_finite, last: p.step, loss: total, norm });
@@ -370,7 +597,10 @@ impl Trainer {
             seconds,
             data_seconds,
             skipped: self.progress.skipped,
-            broken: self.broken + self.stream.broken().len() as u64,
+            broken: self.broken + agreed.broken[1],
+            rank_seconds: agreed.seconds,
+            sum_seconds,
+            out_of_time: agreed.stop || (self.ranks.world() == 1 && self.out_of_time()),
         })
     }
 
@@ -384,10 +614,12 @@ impl Trainer {
         let tracked = self.average.apply(self.model().clone()).put_dinov2(self.frozen.clone());
         let checkpoint = self.checkpoint(self.averaged())?;
         let stage = self.config.stage(step - 1);
-        let figures = validation.measure(&checkpoint, &tracked, &self.config, stage, &self.device)?;
+        let own = validation.measure(&checkpoint, &tracked, &self.config, stage, &self.device);
+        let own = agree(&*self.ranks, own)?;
+        let figures = Figures::of(&*self.ranks, own)?;
         let found = Best { step, psnr: figures.psnr };
         let best = self.progress.best.filter(|best| best.psnr >= found.psnr).unwrap_or(found);
-        if best == found {
+        if best == found && self.ranks.rank() == 0 {
             checkpoint.save(&self.folder.join("best.safetensors"))?;
         }
         self.progress.best = Some(best);
@@ -420,8 +652,16 @@ impl Trainer {
 
     /// Saves everything that [`Trainer::open`] needs to go on, and the checkpoint of the averaged weights beside it.
     ///
-    /// The state is written into a folder of its own and becomes the latest one by a rename; then older ones go.
+    /// The state is written into a folder of its own and becomes the latest one by a rename; then older ones go. Rank 0 does
+    /// it, but all ranks must call it: their weights are compared before.
+    ///
+    /// # Errors
+    /// [`FlowError::Io`], [`FlowError::State`]; [`FlowError::Ranks`] where the ranks' weights have come apart.
     pub fn save(&self) -> Result<PathBuf, FlowError> {
+        self.compare_weights()?;
+        if self.ranks.rank() > 0 {
+            return Ok(self.folder.join("checkpoint.safetensors"));
+        }
         let io = |path: &Path| {
             let path = path.to_path_buf();
             move |source| FlowError::Io { path, source }
@@ -457,6 +697,16 @@ impl Trainer {
         let path = self.folder.join("checkpoint.safetensors");
         self.checkpoint(average)?.save(&path)?;
         Ok(path)
+    }
+
+    /// Refuses ranks whose weights are not those of rank 0 to the bit.
+    fn compare_weights(&self) -> Result<(), FlowError> {
+        if self.ranks.world() == 1 {
+            return Ok(());
+        }
+        let own = [("weights", Weights::of(self.model()).checksum()), ("averaged weights", self.average.checksum())];
+        let own = own.map(|(what, value)| (format!("{what} after step {}", self.progress.step), value));
+        same_on_all(&*self.ranks, &own).map_err(|e| FlowError::Ranks { problem: e.to_string() })
     }
 
     /// The averaged weights with everything that sampling needs.
@@ -520,6 +770,27 @@ impl State {
         Ok(Self { model, average, optimizer, progress })
     }
 
+    /// The state of rank 0, on every rank; others have none, and begin with `model`.
+    fn of_first(ranks: &dyn Ranks, own: Option<Self>, model: FreeRange) -> Result<Self, FlowError> {
+        let text = own.as_ref().map(|own| serde_json::to_vec(&own.progress).expect("plain numbers"));
+        let text = from_first(ranks, &text.unwrap_or_default())?;
+        let progress = serde_json::from_slice(&text).map_err(|e| FlowError::Ranks { problem: e.to_string() })?;
+        let (model, mut average, mut optimizer) = match own {
+            Some(own) => (own.model, own.average, own.optimizer),
+            None => {
+                let average = Weights::of(&model);
+                let optimizer = AdamW::new(average.0.len());
+                (model, average, optimizer)
+            }
+        };
+        let mut weights = Weights::of(&model);
+        for w in weights.0.iter_mut().chain(&mut average.0) {
+            *w = tensor_of_first(ranks, w.clone())?;
+        }
+        optimizer.follow_first(ranks, &average)?;
+        Ok(Self { model: weights.apply(model), average, optimizer, progress })
+    }
+
     /// That of a new run.
     fn begin(
         mut model: FreeRange,
@@ -541,6 +812,7 @@ impl State {
             inherited: initial.is_some(),
             normalization,
             first_object: Some(0),
+            first_objects: Vec::new(),
             broken: 0,
             skipped: 0,
             best: None,
@@ -550,6 +822,104 @@ impl State {
         let optimizer = AdamW::new(average.0.len());
         Self { model, average, optimizer, progress }
     }
+}
+
+/// What a rank needs of its own before it can speak of the run with others.
+struct Prepared {
+    source: Arc<dyn ObjectSource>,
+    validation: Option<Validation>,
+    encoder: Option<Dinov2>,
+    origin: Option<WeightsOrigin>,
+    manifest: String, // a checksum
+}
+
+impl Prepared {
+    fn new(
+        config: &TrainConfig,
+        initial: Option<Initial>,
+        encoder: Option<&EncoderWeights>,
+        [rank, world]: [usize; 2],
+        device: &Device,
+        progress: &mut impl FnMut(&str),
+    ) -> Result<Self, FlowError> {
+        config.validate()?;
+        let lanes = config.data.lanes;
+        if !lanes.is_multiple_of(world) {
+            return Err(FlowError::Config {
+                field: "data.lanes".into(),
+                expected: format!("a multiple of the number of ranks, {world}"),
+                found: lanes.to_string(),
+            });
+        }
+        // Where nothing is differentiated, and features are those of sampling to the bit.
+        let encoder = load_encoder(&config.model.encoder, encoder, device, progress)?;
+        let origin = encoder.as_ref().and_then(|e| e.origin().cloned());
+        if let Some(Initial { checkpoint, .. }) = initial {
+            require_same_model(&config.model, &checkpoint.config)?;
+            let theirs = checkpoint.model.encoder().dinov2().and_then(Dinov2::origin);
+            require_same_encoder(theirs, origin.as_ref(), || "the initial checkpoint".into())?;
+        }
+        let (source, manifest) = training_objects(config, world > 1)?;
+        let validation = validation_objects(config, [rank, world])?;
+        Ok(Self { source, validation, encoder, origin, manifest })
+    }
+}
+
+/// The lanes of a rank, their windows filled.
+fn lanes(
+    data: &DataConfig,
+    positions: &[u64],
+    [rank, world]: [usize; 2],
+    source: &Arc<dyn ObjectSource>,
+) -> Result<Vec<Lane>, FlowError> {
+    let own = (rank..data.lanes).step_by(world);
+    let count = own.len();
+    // All of them begin to make objects before the first one is waited for.
+    let streams: Vec<(usize, Stream)> = own
+        .map(|lane| (lane, Stream::one_of(count, source.clone(), positions[lane], data.lanes as u64, data.workers)))
+        .collect();
+    let filled = streams.into_iter().map(|(number, mut stream)| {
+        let window = (0..data.window / data.lanes).map(|_| stream.take_next().map(|(i, object)| (i, Arc::new(object))));
+        let window = window.collect::<Result<VecDeque<_>, _>>()?;
+        Ok(Lane { number, stream, window })
+    });
+    filled.collect()
+}
+
+/// What is automatic is chosen by rank 0: which arithmetic is faster may look different from each of them.
+fn compute_of_first(ranks: &dyn Ranks, compute: Compute, device: &Device) -> Result<Compute, FlowError> {
+    if ranks.world() == 1 || compute != Compute::Auto {
+        return Ok(compute);
+    }
+    let chosen = serde_json::to_vec(&compute.on(device)).expect("a name");
+    let chosen = serde_json::from_slice::<Compute>(&from_first(ranks, &chosen)?)
+        .map_err(|e| FlowError::Ranks { problem: e.to_string() })?;
+    let supported = chosen.supported(device);
+    agree(
+        ranks,
+        if supported {
+            Ok(())
+        } else {
+            Err(FlowError::Config {
+                field: "optimizer.compute".into(),
+                expected: "what the devices of all ranks can do".into(),
+                found: format!("auto, which is {chosen:?} on rank 0 and not on rank {}", ranks.rank()),
+            })
+        },
+    )?;
+    Ok(chosen)
+}
+
+/// What has to be alike in the configurations of all ranks, in short.
+fn fingerprint(config: &TrainConfig) -> String {
+    let mut c = config.clone();
+    c.data.workers = 0;
+    // These may lie elsewhere on each machine, and are compared by what is in them.
+    c.data.shards = None;
+    if let EncoderConfig::Dinov2(encoder) = &mut c.model.encoder {
+        encoder.weights = None;
+    }
+    sha256(&serde_json::to_vec(&c).expect("a configuration is plain"))
 }
 
 /// What a new run normalises Gaussians by.
@@ -579,24 +949,30 @@ fn shards(config: &TrainConfig, place: &str, split: Split) -> Result<Shards, Flo
     Ok(open(&Store::open(place)?, &config.depths(), Some(split))?)
 }
 
-fn training_objects(config: &TrainConfig) -> Result<Arc<dyn ObjectSource>, FlowError> {
+/// The objects, and a checksum of their description where one is wanted.
+fn training_objects(config: &TrainConfig, checksum: bool) -> Result<(Arc<dyn ObjectSource>, String), FlowError> {
     Ok(match &config.data.shards {
-        Some(place) => Arc::new(shards(config, place, Split::Train)?.shuffled_by(config.seed)),
-        None => Arc::new(generated(config, 0)),
+        Some(place) => {
+            let shards = shards(config, place, Split::Train)?.shuffled_by(config.seed);
+            let text = || sha256(&serde_json::to_vec(shards.manifest()).expect("read from such a text"));
+            let manifest = if checksum { text() } else { String::new() };
+            (Arc::new(shards), manifest)
+        }
+        None => (Arc::new(generated(config, 0)), "generated".into()),
     })
 }
 
-/// Those to measure on, if anything is to be measured.
-fn validation_objects(config: &TrainConfig) -> Result<Option<Validation>, FlowError> {
+/// Those of a rank to measure on, if anything is to be measured.
+fn validation_objects(config: &TrainConfig, share: [usize; 2]) -> Result<Option<Validation>, FlowError> {
     let count = config.validation.objects;
     Ok(match (config.validation.every, &config.data.shards) {
         (0, _) => None,
         (_, Some(place)) => {
             let shards = shards(config, place, Split::Validation)?;
-            Some(Validation::new(&shards, shards.len() as u64, count, config.seed)?)
+            Some(Validation::new(&shards, shards.len() as u64, count, config.seed, share)?)
         }
         // Farther than training comes.
-        (_, None) => Some(Validation::new(&generated(config, 1 << 31), u64::MAX, count, config.seed)?),
+        (_, None) => Some(Validation::new(&generated(config, 1 << 31), u64::MAX, count, config.seed, share)?),
     })
 }
 
@@ -725,6 +1101,7 @@ fn check_same_run(config: &TrainConfig, folder: &Path) -> Result<(), FlowError> 
                 }
                 c.data.shards = c.data.shards.map(|place| local(&place, |path| path.canonicalize()));
                 c.optimizer.compute = Default::default();
+                c.optimizer.wire = Default::default();
                 c.optimizer.schedule = Default::default();
                 c.validation = Default::default();
                 c

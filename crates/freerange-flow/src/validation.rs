@@ -14,6 +14,7 @@ use crate::{
     batch::{Batch, choose_views, step_rng},
     config::{Stage, TrainConfig},
     photometric::Photometric,
+    ranks::{Ranks, gather},
     sample::{SampleConfig, reconstruct},
     train,
 };
@@ -52,18 +53,85 @@ pub struct Figures {
 /// The objects to measure on.
 #[derive(Debug)]
 pub(crate) struct Validation {
-    objects: Vec<Arc<Object>>,
+    objects: Vec<(u64, Arc<Object>)>, // this rank's, with their numbers
     seed: u64,
+}
+
+/// What was measured on an object.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Measured {
+    object: u64,
+    losses: [f32; 3],
+    psnr: Vec<f64>,
+}
+
+impl Measured {
+    /// As bytes: exact, and no number is lost that is not finite.
+    fn write(&self, bytes: &mut Vec<u8>) {
+        bytes.extend(self.object.to_le_bytes());
+        bytes.extend(self.losses.iter().flat_map(|x| x.to_le_bytes()));
+        bytes.extend((self.psnr.len() as u32).to_le_bytes());
+        bytes.extend(self.psnr.iter().flat_map(|x| x.to_le_bytes()));
+    }
+
+    /// The first of `bytes`, which then begin with the next one.
+    fn read(bytes: &mut &[u8]) -> Option<Self> {
+        fn take<const N: usize>(bytes: &mut &[u8]) -> Option<[u8; N]> {
+            let (own, rest) = bytes.split_first_chunk()?;
+            *bytes = rest;
+            Some(*own)
+        }
+        let object = u64::from_le_bytes(take(bytes)?);
+        let mut losses = [0.0; 3];
+        for loss in &mut losses {
+            *loss = f32::from_le_bytes(take(bytes)?);
+        }
+        let count = u32::from_le_bytes(take(bytes)?);
+        let psnr = (0..count).map(|_| Some(f64::from_le_bytes(take(bytes)?))).collect::<Option<_>>()?;
+        Some(Self { object, losses, psnr })
+    }
+}
+
+impl Figures {
+    /// Over what all ranks have measured: sums in the objects' order, so that it does not matter which rank had which.
+    pub(crate) fn of(ranks: &dyn Ranks, own: Vec<Measured>) -> Result<Self, FlowError> {
+        let mut bytes = Vec::new();
+        own.iter().for_each(|m| m.write(&mut bytes));
+        let mut all = Vec::new();
+        for told in gather(ranks, &bytes)? {
+            let mut told = told.as_slice();
+            while !told.is_empty() {
+                let torn = || FlowError::Ranks { problem: "a measurement was cut short".into() };
+                all.push(Measured::read(&mut told).ok_or_else(torn)?);
+            }
+        }
+        all.sort_by_key(|m| m.object);
+        let mut sums = [0f32; 3];
+        for measured in &all {
+            sums.iter_mut().zip(measured.losses).for_each(|(sum, x)| *sum += x);
+        }
+        let [flow, seen, held] = sums.map(|x| x / all.len() as f32);
+        let psnr: Vec<f64> = all.iter().flat_map(|m| m.psnr.iter().copied()).collect();
+        let mut sum = 0.0;
+        psnr.iter().for_each(|x| sum += x);
+        Ok(Self { flow, seen, held, psnr: sum / psnr.len() as f64, samples: psnr.len() })
+    }
 }
 
 /// Views of an object that samples are compared with, at most.
 const COMPARED: usize = 8;
 
 impl Validation {
-    /// Takes the first `count` of `available` objects of `source`.
-    pub fn new(source: &dyn ObjectSource, available: u64, count: usize, seed: u64) -> Result<Self, FlowError> {
-        let count = (count as u64).min(available);
-        let objects = (0..count).map(|i| Ok(Arc::new(source.object(i)?))).collect::<Result<_, FlowError>>()?;
+    /// Takes a rank's share of the first `count` of `available` objects of `source`.
+    pub fn new(
+        source: &dyn ObjectSource,
+        available: u64,
+        count: usize,
+        seed: u64,
+        [rank, world]: [usize; 2],
+    ) -> Result<Self, FlowError> {
+        let own = (rank as u64..(count as u64).min(available)).step_by(world);
+        let objects = own.map(|i| Ok((i, Arc::new(source.object(i)?)))).collect::<Result<_, FlowError>>()?;
         Ok(Self { objects, seed })
     }
 
@@ -75,24 +143,23 @@ impl Validation {
         config: &TrainConfig,
         stage: &Stage,
         device: &Device,
-    ) -> Result<Figures, FlowError> {
+    ) -> Result<Vec<Measured>, FlowError> {
         let photometric = Photometric::new(&checkpoint.normalization, device);
         let rms = Tensor::<1>::from_floats(checkpoint.gradient_rms, device).reshape([1, 1, channel::COUNT]);
         let model_config = ModelConfig { image_size: stage.image_size, ..config.model.clone() };
-        let mut sums = [0.0; 3];
-        let (mut sum, mut samples) = (0.0, 0);
-        for (number, object) in self.objects.iter().enumerate() {
+        let mut measured = Vec::new();
+        for (number, object) in &self.objects {
             // Times, noise and views are the same every time.
-            let mut rng = step_rng(self.seed, number as u64);
+            let mut rng = step_rng(self.seed, *number);
             let one = std::slice::from_ref(object);
             let batch =
                 Batch::draw(one, stage, &model_config, &config.loss, &checkpoint.normalization, &mut rng, device)?;
             let losses = train::step(tracked, batch, &photometric, &rms, &config.loss, device)?;
             let figures = Tensor::cat(vec![losses.flow, losses.seen, losses.held], 0).into_data();
             let figures = figures.try_to_vec::<f32>().map_err(|_| FlowError::NoGradient)?;
-            sums.iter_mut().zip(figures).for_each(|(sum, x)| *sum += x);
-
-            for (inputs, others, fit) in self.tasks(object, config, number) {
+            let &[flow, seen, held] = figures.as_slice() else { return Err(FlowError::NoGradient) };
+            let mut psnr = Vec::new();
+            for (inputs, others, fit) in self.tasks(object, config, *number) {
                 // The size that objects come in is the size that they are sampled and compared at.
                 let sample = SampleConfig { depth: Some(stage.depth), ..config.sample.clone() };
                 let fits = fit.map(|fit| [fit]);
@@ -100,30 +167,23 @@ impl Validation {
                 let found = reconstruct(checkpoint, &[&inputs], fits, &sample, &[self.seed], device, |_| {
                     ControlFlow::Continue(())
                 })?;
-                sum += psnr_over_white(&found[0][0], &others)?;
-                samples += 1;
+                psnr.push(psnr_over_white(&found[0][0], &others)?);
             }
+            measured.push(Measured { object: *number, losses: [flow, seen, held], psnr });
         }
-        let mean = |x: f32| x / self.objects.len() as f32;
-        let [flow, seen, held] = sums.map(mean);
-        Ok(Figures { flow, seen, held, psnr: sum / samples as f64, samples })
+        Ok(measured)
     }
 
     /// Input views, views to compare with, and the fit to start from: each of the object's fits where sampling starts from
     /// one, else one choice of views.
-    fn tasks(
-        &self,
-        object: &Object,
-        config: &TrainConfig,
-        number: usize,
-    ) -> Vec<(Vec<View>, Vec<View>, Option<Cloud>)> {
+    fn tasks(&self, object: &Object, config: &TrainConfig, number: u64) -> Vec<(Vec<View>, Vec<View>, Option<Cloud>)> {
         let (fewest, most) = config.loss.input_views;
         let of = |(chosen, rest): (Vec<&View>, Vec<&View>), fit| {
             let views = |views: Vec<&View>| views.into_iter().cloned().collect::<Vec<View>>();
             (views(chosen), views(rest.into_iter().take(COMPARED).collect()), fit)
         };
         if config.sample.start.is_none() {
-            let mut rng = step_rng(!self.seed, number as u64);
+            let mut rng = step_rng(!self.seed, number);
             let count = 4usize.clamp(fewest, most);
             return vec![of(choose_views(&object.views, count, false, &mut rng), None)];
         }

@@ -4,6 +4,8 @@ use burn::{
     module::{Module, ModuleMapper, ModuleVisitor, Param},
     tensor::Tensor,
 };
+use freerange_core::sha256;
+use rayon::prelude::*;
 
 /// All float parameters of a module, flattened, in the order in which the module visits them.
 #[derive(Clone, Debug)]
@@ -23,6 +25,14 @@ impl Weights {
         let mut collect = Collect(Vec::new());
         module.visit(&mut collect);
         Self(collect.0)
+    }
+
+    /// A checksum of all bits.
+    pub fn checksum(&self) -> String {
+        let all: Vec<_> = self.0.iter().map(|w| w.to_data()).collect();
+        // Of each tensor's, which are made at the same time.
+        let each: Vec<String> = all.par_iter().map(|data| sha256(data.as_bytes())).collect();
+        sha256(each.concat().as_bytes())
     }
 
     /// Puts the values into a module of the same structure.

@@ -114,6 +114,18 @@ impl fmt::Display for DeviceName {
 }
 
 impl DeviceName {
+    /// [`Auto`](Self::Auto) for the process of this number on its machine: of the GPUs that this program can use, the one of
+    /// that number, from the first on again where there are fewer; without any, the CPU.
+    pub fn auto_of(number: usize) -> Device {
+        let nth = |api: Api| {
+            let mut found = api.devices();
+            // No other one is opened: each would give memory to it.
+            let device = if found.is_empty() { return None } else { found.swap_remove(number % found.len()) };
+            matches!(properties(&device), Ok((_, true))).then_some(device)
+        };
+        Api::ALL.into_iter().find_map(nth).unwrap_or_else(Device::flex)
+    }
+
     /// The device, without differentiation, and ready to use.
     ///
     /// # Errors

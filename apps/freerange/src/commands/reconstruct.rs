@@ -24,6 +24,7 @@ use crate::{
     output::OutputFolder,
     photos::{Photos, Scene, UpChoice},
     progress::Progress,
+    ranks::Job,
     runtime::local,
 };
 use holdout::Holdout;
@@ -42,7 +43,7 @@ pub struct Args {
     /// A file that names a scene on each line, relative to itself; lines that begin with # are passed over.
     #[arg(long, value_name = "FILE")]
     list: Option<PathBuf>,
-    /// Of many scenes make only share I of N (from 0), as in an array of jobs.
+    /// Of many scenes make only share I of N (from 0), as in an array of jobs. Without it, processes of mpirun or srun share them themselves.
     #[arg(long, value_name = "I/N", value_parser = share)]
     share: Option<(usize, usize)>,
     /// Of many scenes make those again that are finished.
@@ -264,8 +265,14 @@ struct Before {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
+    let job = Job::start_if(batch::asked(args) && args.share.is_none())?;
+    let result = run_in(args, &job);
+    job.end(result)
+}
+
+fn run_in(args: &Args, job: &Job) -> Result<(), CliError> {
     if batch::asked(args) {
-        return batch::run(args);
+        return batch::run(args, job);
     }
     if args.restart {
         return Err(CliError::input("--restart: expected several scenes, found one: it is always made anew"));

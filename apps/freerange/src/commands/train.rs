@@ -1,24 +1,35 @@
 //! `freerange train`
 
-use std::{path::PathBuf, time::Instant};
+use std::{
+    path::{Path, PathBuf},
+    time::{Duration, Instant},
+};
 
 use burn::tensor::Device;
-use freerange::{DeviceName, EncoderPlaces, load_checkpoint, require};
+use freerange::{DeviceName, EncoderPlaces, checkpoint_sha256, load_checkpoint, require};
+use freerange_core::sha256_of;
 use freerange_flow::{
+    FlowError,
     batch::step_rng,
     config::TrainConfig,
     log::Log,
-    trainer::{Initial, StepReport, Trainer, Validated},
+    trainer::{Among, Initial, StepReport, Trainer, Validated},
 };
 
 use freerange_model::{Compute, Execution, FreeRange, ModelConfig, ModelInfo, Workload};
 
-use crate::{error::CliError, progress::Progress, runtime::local_or_shipped};
+use crate::{
+    error::CliError,
+    progress::Progress,
+    ranks::Job,
+    runtime::{commit, local_or_shipped},
+};
 
 /// Train a model. Run the same command again to go on where it was stopped.
 ///
 /// Writes checkpoint.safetensors (averaged weights), log.jsonl (one line per step) and the state to go on from; with
 /// `[validation]` in the configuration also best.safetensors, the weights that measured best on other objects.
+/// Built with `--features mpi` and started as several processes by mpirun or srun, these train one model together.
 #[derive(clap::Args)]
 pub struct Args {
     /// Configuration: a file such as configs/tiny.toml, or tiny, base or paper.
@@ -53,41 +64,77 @@ pub struct Args {
 
 pub fn run(args: &Args) -> Result<(), CliError> {
     let begin = Instant::now();
-    let device = args.device.open()?;
-    let config = TrainConfig::load(&args.config)?;
-    require(config.optimizer.compute, &device)?;
+    let job = Job::start()?;
+    let result = train(args, &job, begin);
+    job.end(result)
+}
+
+fn train(args: &Args, job: &Job, begin: Instant) -> Result<(), CliError> {
+    let say = |text: &str| {
+        if job.first() {
+            eprintln!("{text}");
+        }
+    };
+    let prepared = || {
+        let device = job.open(args.device)?;
+        let config = TrainConfig::load(&args.config)?;
+        require(config.optimizer.compute, &device)?;
+        Ok((device, config))
+    };
+    let (device, config) = job.together(prepared())?;
     let output = match &args.output {
         Some(output) if !args.dry_run => output,
-        _ => return dry_run(&config, &device),
+        _ => return job.together(if job.first() { dry_run(&config, &device) } else { Ok(()) }),
     };
     if config.optimizer.compute == Compute::Auto {
-        eprintln!("computing in {}", config.optimizer.compute.on(&device));
+        say(&format!("computing in {}", config.optimizer.compute.on(&device)));
     }
     let total = config.total_steps();
     let encoders = EncoderPlaces::at(args.encoder_weights.clone());
-    let encoder = encoders.for_training(&config.model.encoder)?;
-    let initial = local_or_shipped(args.initial.as_deref())?;
-    let initial = initial.map(|path| load_checkpoint(Some(&path), &encoders, &device)).transpose()?;
+    let weights = || {
+        let encoder = encoders.for_training(&config.model.encoder)?;
+        let path = local_or_shipped(args.initial.as_deref())?;
+        let initial = path.as_ref().map(|path| load_checkpoint(Some(path), &encoders, &device)).transpose()?;
+        let identity = match job.world() {
+            1 => Vec::new(),
+            _ => identity(path.as_deref(), args.remeasure)?,
+        };
+        Ok((encoder, initial, identity))
+    };
+    let (encoder, initial, identity) = job.together(weights())?;
     let initial = initial.as_ref().map(|checkpoint| Initial { checkpoint, remeasure: args.remeasure });
-    let mut trainer = Trainer::open_with(config, output, initial, encoder.as_ref(), &device, |m| eprintln!("{m}"))?;
-    let mut log = Log::open(&output.join("log.jsonl"), trainer.step_count())?;
-    let mut bar = Progress::new("training", total);
+    let among = Among { ranks: job.ranks.clone(), identity };
+    let trainer = Trainer::open_among(among, config, output, initial, encoder.as_ref(), &device, say);
+    let mut trainer = job.together(trainer.map_err(CliError::from))?;
+    let allowed = args.minutes.and_then(|minutes| Duration::try_from_secs_f64(60.0 * minutes.max(0.0)).ok());
+    if let Some(time) = allowed.and_then(|allowed| begin.checked_add(allowed)) {
+        trainer.stop_at(time);
+    }
+    let log = || Log::open(&output.join("log.jsonl"), trainer.step_count()).map_err(CliError::from);
+    // Rank 0 speaks and writes for all.
+    let mut log = job.together(if job.first() { log().map(Some) } else { Ok(None) })?;
+    let mut bar = job.first().then(|| Progress::new("training", total));
     while trainer.step_count() < total {
         let report = match trainer.step() {
             Ok(report) => report,
+            // The others cannot be heard any more.
+            Err(e @ FlowError::Ranks { .. }) => return Err(e.into()),
             Err(e) => {
                 // What was learned before is not lost; if it cannot be saved either, the first error is the one to tell.
-                let saved = log.sync().and_then(|()| trainer.save());
-                eprintln!(
-                    "{}",
-                    saved.map_or_else(|e| e.to_string(), |_| format!("saved step {}", trainer.step_count()))
-                );
-                return Err(e.into());
+                let synced = log.as_mut().map_or(Ok(()), Log::sync);
+                let saved = trainer.save();
+                let saved = synced.and(saved);
+                say(&saved.map_or_else(|e| e.to_string(), |_| format!("saved step {}", trainer.step_count())));
+                return job.together(Err(e.into()));
             }
         };
-        log.add(&report)?;
-        bar.at(report.step, &line(&report));
-        if let Some(validated) = trainer.validate()? {
+        if let (Some(log), Some(bar)) = (&mut log, &mut bar) {
+            log.add(&report)?;
+            bar.at(report.step, &line(&report));
+        }
+        if let Some(validated) = trainer.validate()?
+            && let Some(log) = &mut log
+        {
             log.add(&validated)?;
             let Validated { step, validation: v, best, .. } = validated;
             eprintln!(
@@ -95,18 +142,33 @@ pub fn run(args: &Args) -> Result<(), CliError> {
                 v.flow, v.held, v.psnr, v.samples, best.psnr, best.step
             );
         }
-        let out_of_time = args.minutes.is_some_and(|m| begin.elapsed().as_secs_f64() > 60.0 * m);
-        if report.step % args.save_every == 0 || report.step == total || out_of_time {
-            log.sync()?;
+        if report.step % args.save_every == 0 || report.step == total || report.out_of_time {
+            log.as_mut().map_or(Ok(()), Log::sync)?;
             trainer.save()?;
         }
-        if out_of_time {
+        if report.out_of_time {
             break;
         }
     }
-    bar.finish();
-    println!("{} of {total} steps; {}", trainer.step_count(), output.join("checkpoint.safetensors").display());
+    if let Some(bar) = bar {
+        bar.finish();
+        println!("{} of {total} steps; {}", trainer.step_count(), output.join("checkpoint.safetensors").display());
+    }
     Ok(())
+}
+
+/// What has to be the same on all ranks, besides what the trainer compares itself.
+fn identity(initial: Option<&Path>, remeasure: bool) -> Result<Vec<(String, String)>, CliError> {
+    let program = std::env::current_exe().map_err(CliError::failure)?;
+    let hash = std::fs::File::open(&program).and_then(|mut file| sha256_of(&mut file));
+    let initial = initial.map_or(Ok("none".into()), |path| checkpoint_sha256(Some(path)))?;
+    let values = [
+        ("version of freerange", format!("{} ({})", env!("CARGO_PKG_VERSION"), commit())),
+        ("program", hash.map_err(|e| CliError::file(&program, e))?),
+        ("--initial", initial),
+        ("--remeasure", remeasure.to_string()),
+    ];
+    Ok(values.map(|(what, value)| (what.to_owned(), value)).to_vec())
 }
 
 /// Builds the model, and tells what its training needs.
@@ -121,7 +183,11 @@ fn dry_run(config: &TrainConfig, device: &Device) -> Result<(), CliError> {
     let views = config.loss.input_views.1;
     for (number, stage) in config.stages.iter().enumerate() {
         let model = ModelConfig { image_size: stage.image_size, ..config.model.clone() };
-        let workload = Workload { batch: stage.at_a_time(), views, gaussians: 1 << stage.depth };
+        let workload = Workload {
+            batch: stage.at_a_time().min(stage.batch / config.data.lanes),
+            views,
+            gaussians: 1 << stage.depth,
+        };
         let o = &config.optimizer;
         let execution = Execution { gpu: *device != Device::flex(), compute: o.compute, recompute: o.recompute };
         let size = |own: Option<u32>, all: u32| own.unwrap_or(all);
@@ -149,6 +215,9 @@ fn line(report: &StepReport) -> String {
         if count > 0 {
             line += &format!(", {count} {what}");
         }
+    }
+    if let Some((rank, waited)) = report.slowest() {
+        line += &format!(", rank {rank} slowest, the others waited {waited:.2} s");
     }
     line
 }

@@ -3,6 +3,7 @@ use std::io::{Seek, SeekFrom, Write};
 use freerange_build::{BuildOptions, Items, build};
 
 use super::*;
+use crate::ranks::threads::among;
 use crate::sample::SampleConfig;
 
 /// A model and objects of the smallest kind.
@@ -339,4 +340,227 @@ fn a_batch_may_be_computed_in_parts() {
     }
     assert_eq!(pieces, found);
     assert!(steps("pieces", &config, 4).1 == end);
+}
+
+/// Shards of objects for a configuration, and that with them: they are read in no time.
+fn with_shards(mut config: TrainConfig, place: &Path) -> TrainConfig {
+    let store = Store::local(&place.join("shards"));
+    build(&config.build_config(), &Items::generated(40, 1), &store, &BuildOptions::default(), |_| ()).unwrap();
+    config.data.shards = Some(place.join("shards").to_str().unwrap().into());
+    config
+}
+
+/// Four lanes, two stages with different batches, depths and parts, objects that come and go, validation.
+fn in_lanes() -> TrainConfig {
+    let mut config = config();
+    config.data = DataConfig { lanes: 4, window: 12, fresh: 4, ..config.data };
+    config.stages[0] = Stage { depth: 3, batch: 8, micro_batch: Some(1), steps: 5, ..config.stages[0].clone() };
+    config.stages.push(Stage { depth: 4, batch: 4, micro_batch: None, steps: 25, ..config.stages[0].clone() });
+    config.validation = crate::ValidationConfig { every: 4, objects: 3 };
+    config.sample = SampleConfig { steps: 1, cfg_scale: 1.0, gradient_size: 16, ..SampleConfig::default() };
+    config.validate().unwrap();
+    config
+}
+
+fn open_among(ranks: Rc<dyn Ranks>, config: &TrainConfig, folder: &Path) -> Result<Trainer, FlowError> {
+    let among = Among { ranks, identity: vec![("program".into(), "this one".into())] };
+    Trainer::open_among(among, config.clone(), folder, None, None, &Device::flex(), |_| {})
+}
+
+/// What a rank reports: losses and norms of the steps, figures of validations, checksums and positions at the end.
+type Told = (Vec<[f32; 5]>, Vec<Figures>, [String; 2], Vec<u64>);
+
+/// Goes on in `folder` until a step, with so many ranks; what each of them has to say.
+fn told(world: usize, config: &TrainConfig, folder: &Path, until: u64) -> Vec<Told> {
+    among(world, |ranks| {
+        let mut trainer = open_among(ranks.clone(), config, folder).unwrap();
+        assert_eq!(trainer.lanes.len(), config.data.lanes / world);
+        let (mut steps, mut figures) = (Vec::new(), Vec::new());
+        while trainer.step_count() < until {
+            let r = trainer.step().unwrap();
+            assert_eq!(r.rank_seconds.len(), if world > 1 { world } else { 0 });
+            steps.push([r.loss, r.flow, r.seen, r.held, r.gradient_norm]);
+            figures.extend(trainer.validate().unwrap().map(|v| v.validation));
+        }
+        trainer.save().unwrap();
+        let checksums = [Weights::of(&trainer.model).checksum(), trainer.average.checksum()];
+        (steps, figures, checksums, trainer.progress.first_objects.clone())
+    })
+}
+
+fn close(found: &[[f32; 5]], expected: &[[f32; 5]]) {
+    assert_eq!(found.len(), expected.len());
+    for (step, (a, b)) in found.iter().zip(expected).enumerate() {
+        for (a, b) in a.iter().zip(b) {
+            assert!((a - b).abs() <= 1e-5 * b.abs().max(1e-3), "step {step}: {a} and {b}: {found:?} {expected:?}");
+        }
+    }
+}
+
+#[test]
+fn any_number_of_ranks_trains_the_same() {
+    let place = tempfile::tempdir().unwrap();
+    let mut config = in_lanes();
+    config.data.shard.validation = 0.2;
+    let config = with_shards(config, place.path());
+    let alone = told(1, &config, &place.path().join("1"), 20).remove(0);
+    assert!(alone.0.iter().any(|step| step[0] != alone.0[0][0]) && alone.1.len() == 5);
+    for world in [2, 4] {
+        let all = told(world, &config, &place.path().join(world.to_string()), 20);
+        for rank in &all {
+            assert!(*rank == all[0], "ranks have come apart");
+        }
+        close(&all[0].0, &alone.0);
+        assert_eq!(all[0].3, alone.3);
+        for (a, b) in all[0].1.iter().zip(&alone.1) {
+            assert!((a.psnr - b.psnr).abs() < 1e-3 && a.samples == b.samples, "{a:?} {b:?}");
+            assert!((a.flow - b.flow).abs() < 1e-4 * b.flow, "{a:?} {b:?}");
+        }
+    }
+    // From one to two, to one, to four: as if never changed.
+    let folder = place.path().join("changing");
+    let (mut steps, mut last) = (Vec::new(), None);
+    for (world, until) in [(1, 3), (2, 7), (1, 11), (4, 16), (2, 20)] {
+        let rank = told(world, &config, &folder, until).remove(0);
+        steps.extend(rank.0);
+        last = Some(rank.3);
+    }
+    close(&steps, &alone.0);
+    assert_eq!(last, Some(alone.3));
+    // The same number of ranks, stopped and resumed: to the bit.
+    let whole = told(2, &config, &place.path().join("2"), 24).remove(0);
+    let folder = place.path().join("pieces");
+    let pieces = [9, 20, 24].map(|until| told(2, &config, &folder, until).remove(0));
+    assert_eq!(pieces[2].2, whole.2);
+}
+
+#[test]
+fn an_object_that_one_rank_cannot_read_is_left_out_on_all() {
+    let place = tempfile::tempdir().unwrap();
+    let path = |name: &str| place.path().join(name);
+    let mut config = in_lanes();
+    config.validation.every = 0;
+    let config = with_shards(config, place.path());
+    let shards =
+        Shards::open(&Store::local(&path("shards")), &[3, 4], Some(Split::Train)).unwrap().shuffled_by(config.seed);
+    let broken = shards.id(13).to_owned();
+    let of = |s: &&freerange_data::ShardRecord| s.objects.iter().any(|o| o.id == broken);
+    let shard = shards.manifest().shards.iter().find(of).unwrap();
+    let object = shard.objects.iter().find(|o| o.id == broken).unwrap();
+    let mut file = std::fs::File::options().write(true).open(path("shards").join(shard.name())).unwrap();
+    file.seek(SeekFrom::Start(object.offset)).unwrap();
+    file.write_all(&vec![0xa5; object.bytes as usize]).unwrap();
+    drop(file);
+    let run = |world: usize, folder: &str, until: u64| {
+        let found = among(world, |ranks| {
+            let mut trainer = open_among(ranks, &config, &path(folder)).unwrap();
+            let mut reports = Vec::new();
+            while trainer.step_count() < until {
+                let r = trainer.step().unwrap();
+                reports.push([r.loss, r.flow, r.seen, r.held, r.gradient_norm]);
+            }
+            trainer.save().unwrap();
+            (reports, trainer.progress.broken, trainer.progress.first_objects.clone())
+        });
+        found.into_iter().next().unwrap()
+    };
+    let alone = run(1, "1", 6);
+    // Lane 1 is one object ahead of the others.
+    assert_eq!((alone.1, &alone.2[..]), (1, &[24, 29, 26, 27][..]));
+    let two = run(2, "2", 6);
+    close(&two.0, &alone.0);
+    assert_eq!((two.1, two.2), (alone.1, alone.2.clone()));
+    let mut pieces = run(2, "pieces", 2).0;
+    pieces.extend(run(4, "pieces", 5).0);
+    let last = run(1, "pieces", 6);
+    pieces.extend(last.0);
+    close(&pieces, &alone.0);
+    assert_eq!((last.1, last.2), (alone.1, alone.2));
+}
+
+#[test]
+fn where_one_rank_fails_all_stop_at_the_same_step_and_can_go_on() {
+    let place = tempfile::tempdir().unwrap();
+    let config = in_lanes();
+    let found = among(2, |ranks| {
+        let mut trainer = open_among(ranks.clone(), &config, &place.path().join("run")).unwrap();
+        (0..3).for_each(|_| drop(trainer.step().unwrap()));
+        if ranks.rank() == 1 {
+            trainer.ahead = Some(Err(FlowError::NoViews));
+        }
+        let error = trainer.step().unwrap_err();
+        trainer.save().unwrap();
+        (error, trainer.step_count())
+    });
+    assert!(matches!(found[0], (FlowError::Elsewhere { rank: 1 }, 3)), "{:?}", found[0]);
+    assert!(matches!(found[1], (FlowError::NoViews, 3)), "{:?}", found[1]);
+    let again = told(2, &config, &place.path().join("run"), 6).remove(0);
+    let never = told(2, &config, &place.path().join("never"), 6).remove(0);
+    assert_eq!((&again.2, &again.3), (&never.2, &never.3));
+}
+
+#[test]
+fn ranks_that_cannot_train_together_are_refused() {
+    let place = tempfile::tempdir().unwrap();
+    let refused = |world: usize, change: fn(&mut TrainConfig)| {
+        let found = among(world, |ranks| {
+            let mut config = in_lanes();
+            if ranks.rank() + 1 == world {
+                change(&mut config);
+            }
+            open_among(ranks, &config, &place.path().join("run")).err().expect("refused").to_string()
+        });
+        assert!(!place.path().join("run").exists());
+        found
+    };
+    for text in refused(3, |_| ()) {
+        assert_eq!(text, "data.lanes: expected a multiple of the number of ranks, 3, found 4");
+    }
+    for text in refused(2, |config| config.loss.seen = false) {
+        assert!(
+            text.starts_with("rank 1: configuration: expected ") && text.contains(" as on rank 0, found "),
+            "{text}"
+        );
+    }
+    let found = refused(2, |config| config.data.shards = Some("/nowhere/at/all".into()));
+    assert!(found[0] == "rank 1 has failed" && found[1].contains("/nowhere/at/all"), "{found:?}");
+}
+
+#[test]
+fn all_ranks_stop_when_one_is_out_of_time_and_weights_that_came_apart_are_told() {
+    let place = tempfile::tempdir().unwrap();
+    let config = in_lanes();
+    among(2, |ranks| {
+        let mut trainer = open_among(ranks.clone(), &config, &place.path().join("run")).unwrap();
+        assert!(!trainer.step().unwrap().out_of_time);
+        if ranks.rank() == 1 {
+            trainer.stop_at(Instant::now());
+        }
+        assert!(trainer.step().unwrap().out_of_time);
+        trainer.save().unwrap();
+        if ranks.rank() == 1 {
+            trainer.average.0[0] = trainer.average.0[0].clone() + 1e-3;
+        }
+        let error = trainer.save().unwrap_err().to_string();
+        assert!(error.contains("rank 1: averaged weights after step 2"), "{error}");
+    });
+}
+
+#[test]
+fn lanes_divide_batch_and_window() {
+    let refused = |change: fn(&mut TrainConfig)| {
+        let mut config = in_lanes();
+        change(&mut config);
+        config.validate().unwrap_err().to_string()
+    };
+    let found = [
+        refused(|c| c.data.window = 10),
+        refused(|c| c.data.fresh = 2),
+        refused(|c| c.stages[1].batch = 6),
+        refused(|c| c.data.lanes = 0),
+    ];
+    assert_eq!(found[0], "data.window: expected a multiple of data.lanes, 4, found 10");
+    assert_eq!(found[1], "data.fresh: expected a multiple of data.lanes, 4, found 2");
+    assert_eq!(found[2], "stage.batch: expected a multiple of data.lanes, 4, found 6");
+    assert_eq!(found[3], "data.lanes: expected 1 to 4096, found 0");
 }

@@ -1,6 +1,7 @@
 //! `freerange bench`
 
 mod kernels;
+mod sums;
 mod timer;
 mod whole;
 
@@ -61,6 +62,8 @@ enum Part {
     Sample,
     /// Training steps.
     Train,
+    /// Sums over the processes of a launcher, of as many numbers as a model has: in 32 bits and in bf16. Alone.
+    Sum,
 }
 
 impl Part {
@@ -74,6 +77,7 @@ impl std::fmt::Display for Part {
             Self::Block => "block",
             Self::Sample => "sample",
             Self::Train => "train",
+            Self::Sum => "sum",
         })
     }
 }
@@ -95,6 +99,9 @@ struct BenchReport {
 }
 
 pub fn run(args: &Args) -> Result<(), CliError> {
+    if args.only.contains(&Part::Sum) {
+        return sums::run(args);
+    }
     let device = args.device.open()?;
     let listed = devices().into_iter().find(|d| d.is(&device));
     let (name, hardware, gpu) = listed

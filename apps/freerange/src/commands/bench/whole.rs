@@ -73,7 +73,7 @@ impl Sample {
 }
 
 /// The configuration with objects that are quick to make.
-fn load(size: &str) -> Result<TrainConfig, CliError> {
+pub(super) fn load(size: &str) -> Result<TrainConfig, CliError> {
     let mut config = TrainConfig::load(Path::new(size))?;
     config.data.shards = None;
     // Time does not depend on weights.

@@ -6,7 +6,7 @@ use freerange::{Options, SampleConfig};
 use freerange_eval::{
     Report, RunFolder,
     ablation::{Set, Study, Values, Variant, variants},
-    runner::{Run, report},
+    runner::{Run, Shared, report},
 };
 use serde_json::Value;
 
@@ -15,7 +15,7 @@ use super::{
     methods::{Method, MethodName},
     verdict, work,
 };
-use crate::error::CliError;
+use crate::{error::CliError, ranks::Job};
 
 /// Arguments of `eval ablations`.
 #[derive(clap::Args)]
@@ -60,23 +60,23 @@ fn set(text: &str) -> Result<Set, String> {
 /// The folder of the default settings.
 const DEFAULT: &str = "default";
 
-pub fn run(args: &Args) -> Result<(), CliError> {
+pub fn run(args: &Args, job: &Job) -> Result<(), CliError> {
     let a = &args.run;
     let inputs = args.checked_inputs()?;
-    let device = a.sampling.device.open()?;
+    let device = job.open(a.sampling.device)?;
     let method = a.open_method(&device)?;
     let Method::Model { model, options: default, sha256 } = &method else {
         return Err(CliError::failure("a model's method expected"));
     };
     // All settings are looked at before the first one is worked on.
     let planned = args.plan(default, inputs)?;
-    let (shared, source) = a.open_shared(&device)?;
+    let (shared, source) = a.open_shared(&device, job)?;
     let open = |folder: &str, options: &Options, count: usize| {
         let method = Method::Model { model: model.clone(), options: Box::new(options.clone()), sha256: sha256.clone() };
         let settings = a.settings(&method, &[count], &shared, &source);
         let path = args.output.join(folder);
         let prefix = format!("{folder}: ");
-        let folder = RunFolder::open(&path, &settings, a.restart)?;
+        let folder = job.first_then_others(|| Ok(RunFolder::open(&path, &settings, a.restart && job.first())?))?;
         let method = Box::new(method);
         Ok::<_, CliError>(Run { method, folder, settings, views: a.views.sets(), inputs: vec![count], prefix })
     };
@@ -91,30 +91,26 @@ pub fn run(args: &Args) -> Result<(), CliError> {
             }
         });
     }
-    work(&runs, &shared, args.json)?;
+    job.together(work(&runs, &shared, args.json, job))?;
     if a.share.is_some() {
         println!("this share is done; run again without --share for the report");
         return Ok(());
     }
-    let environment = a.environment(&device);
-    let reports = runs.iter().map(|r| report(r, &shared, &environment)).collect::<Result<Vec<Report>, _>>()?;
-    if reports[0].measured().next().is_none() {
-        return verdict(&reports[..1]);
+    if !job.first() {
+        return job.together(Ok(()));
     }
-    let variants = planned.into_iter().zip(run_of);
-    let variants = variants.map(|((variant, _), i)| {
-        let folder = if i == 0 { DEFAULT.to_owned() } else { variant.folder.clone() };
-        (variant, folder, reports[i].clone())
-    });
-    let study = Study::new(&reports[0], variants.collect(), 0)?;
-    args.write(&study, &environment)?;
-    verdict(&reports)
+    job.together(args.report(&a.environment(&device), &runs, &shared, planned, run_of))
 }
 
 /// Options and number of inputs of a variant; none where they are the default's.
 type Different = Option<(Options, usize)>;
 
 impl Args {
+    /// Whether processes that were started together share the work.
+    pub fn is_shared(&self) -> bool {
+        self.run.share.is_none()
+    }
+
     /// The number of input views, where the arguments go together.
     fn checked_inputs(&self) -> Result<usize, CliError> {
         if self.run.method != MethodName::Model {
@@ -149,6 +145,29 @@ impl Args {
             Ok((variant, (!same).then_some((options, count))))
         };
         variants(&self.sets, &values).into_iter().map(plan).collect()
+    }
+
+    /// The reports of all runs, and the study of them.
+    fn report(
+        &self,
+        environment: &freerange_eval::Environment,
+        runs: &[Run],
+        shared: &Shared,
+        planned: Vec<(Variant, Different)>,
+        run_of: Vec<usize>,
+    ) -> Result<(), CliError> {
+        let reports = runs.iter().map(|r| report(r, shared, environment)).collect::<Result<Vec<Report>, _>>()?;
+        if reports[0].measured().next().is_none() {
+            return verdict(&reports[..1]);
+        }
+        let variants = planned.into_iter().zip(run_of);
+        let variants = variants.map(|((variant, _), i)| {
+            let folder = if i == 0 { DEFAULT.to_owned() } else { variant.folder.clone() };
+            (variant, folder, reports[i].clone())
+        });
+        let study = Study::new(&reports[0], variants.collect(), 0)?;
+        self.write(&study, environment)?;
+        verdict(&reports)
     }
 
     /// Writes the study into the folder and prints it.

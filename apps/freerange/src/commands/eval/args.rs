@@ -19,6 +19,7 @@ use super::{
 use crate::{
     commands::reconstruct::Sampling,
     error::CliError,
+    ranks::Job,
     runtime::{commit, local_or_shipped},
 };
 
@@ -170,7 +171,9 @@ impl RunArgs {
     }
 
     /// Opens everything that runs share, and what the objects' numbers depend on.
-    pub fn open_shared(&self, device: &Device) -> Result<(Shared, Value), CliError> {
+    pub fn open_shared(&self, device: &Device, job: &Job) -> Result<(Shared, Value), CliError> {
+        let (index, count) = job.share();
+        let share = self.share.unwrap_or(Share { index: index as u64, count: count as u64 });
         let source: Source = self.source.open()?;
         let settings = source.settings().clone();
         let config = ScorerConfig {
@@ -189,13 +192,8 @@ impl RunArgs {
             let reasons: Vec<&String> = scorer.missing().values().collect();
             return Err(CliError::input(format!("no metric can be computed: {reasons:?}")));
         }
-        let shared = Shared {
-            objects: Box::new(source),
-            scorer,
-            pictures: self.pictures.into(),
-            share: self.share.unwrap_or_default(),
-            commit: commit(),
-        };
+        let shared =
+            Shared { objects: Box::new(source), scorer, pictures: self.pictures.into(), share, commit: commit() };
         Ok((shared, settings))
     }
 

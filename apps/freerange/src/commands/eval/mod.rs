@@ -14,7 +14,7 @@ use freerange_eval::{
     runner::{Event, Run, Shared, line, report},
 };
 
-use crate::{error::CliError, progress::Progress};
+use crate::{error::CliError, progress::Progress, ranks::Job};
 use args::RunArgs;
 
 /// Arguments of `eval`.
@@ -42,19 +42,32 @@ enum Command {
 }
 
 pub fn run(args: &Args) -> Result<(), CliError> {
-    match &args.command {
-        Some(Command::Compare(args)) => compare::run(args),
-        Some(Command::Ablations(args)) => ablations::run(args),
-        None => evaluate(args),
+    if let Some(Command::Compare(args)) = &args.command {
+        return compare::run(args);
     }
+    let shared = match &args.command {
+        Some(Command::Ablations(args)) => args.is_shared(),
+        _ => args.run.share.is_none(),
+    };
+    let job = Job::start_if(shared)?;
+    let result = match &args.command {
+        Some(Command::Ablations(args)) => ablations::run(args, &job),
+        _ => evaluate(args, &job),
+    };
+    job.end(result)
 }
 
-fn evaluate(args: &Args) -> Result<(), CliError> {
+fn evaluate(args: &Args, job: &Job) -> Result<(), CliError> {
     // Without a folder to keep, results lie in one that goes away.
     let temporary = match (&args.output, args.json) {
         (Some(_), _) => None,
-        (None, true) => Some(tempfile::tempdir().map_err(CliError::failure)?),
-        (None, false) => return Err(CliError::input("expected -o OUT, a folder for the results, or --json")),
+        (None, true) if job.world() == 1 => Some(tempfile::tempdir().map_err(CliError::failure)?),
+        (None, true) => {
+            return job.together(Err(CliError::input("expected -o OUT, a folder that all processes share")));
+        }
+        (None, false) => {
+            return job.together(Err(CliError::input("expected -o OUT, a folder for the results, or --json")));
+        }
     };
     let output: &Path = match (&args.output, &temporary) {
         (Some(path), _) => path,
@@ -62,29 +75,39 @@ fn evaluate(args: &Args) -> Result<(), CliError> {
         (None, None) => unreachable!("refused above"),
     };
     let a = &args.run;
-    let device = a.sampling.device.open()?;
-    let method = a.open_method(&device)?;
-    let (shared, source) = a.open_shared(&device)?;
+    let opened = || {
+        let device = job.open(a.sampling.device)?;
+        let method = a.open_method(&device)?;
+        let (shared, source) = a.open_shared(&device, job)?;
+        Ok((device, method, shared, source))
+    };
+    let (device, method, shared, source) = job.together(opened())?;
     let inputs = a.inputs();
     let settings = a.settings(&method, &inputs, &shared, &source);
-    let folder = RunFolder::open(output, &settings, a.restart)?;
+    let folder = job.first_then_others(|| Ok(RunFolder::open(output, &settings, a.restart && job.first())?))?;
     let run = Run { method: Box::new(method), folder, settings, views: a.views.sets(), inputs, prefix: String::new() };
     let runs = [run];
-    work(&runs, &shared, args.json)?;
+    job.together(work(&runs, &shared, args.json, job))?;
     if a.share.is_some() {
         println!("this share is done; run again without --share for the report");
         return Ok(());
     }
-    let report = report(&runs[0], &shared, &a.environment(&device))?;
-    match args.json {
-        true => println!("{}", serde_json::to_string_pretty(&report).map_err(CliError::input)?),
-        false => print(&report, output),
-    }
-    verdict([&report])
+    let report = || {
+        let report = report(&runs[0], &shared, &a.environment(&device))?;
+        match args.json {
+            true => println!("{}", serde_json::to_string_pretty(&report).map_err(CliError::input)?),
+            false => print(&report, output),
+        }
+        verdict([&report])
+    };
+    job.together(if job.first() { report() } else { Ok(()) })
 }
 
 /// Works on all cases, and says so on the screen; `quiet`: with a bar alone.
-fn work(runs: &[Run], shared: &Shared, quiet: bool) -> Result<(), CliError> {
+fn work(runs: &[Run], shared: &Shared, quiet: bool, job: &Job) -> Result<(), CliError> {
+    if !job.first() {
+        return Ok(freerange_eval::runner::work(runs, shared, &mut |_| {})?);
+    }
     let mut bar = None;
     freerange_eval::runner::work(runs, shared, &mut |event| match event {
         Event::Cases { done, total, object } => {

@@ -9,10 +9,11 @@ use std::{
 
 use freerange::{Reconstructor, Scores, checkpoint_sha256};
 use freerange_core::write_atomically;
+use freerange_flow::ranks::gather;
 use serde::{Deserialize, Serialize};
 
 use super::{Args, SceneReport};
-use crate::{error::CliError, runtime::local_or_shipped};
+use crate::{error::CliError, ranks::Job, runtime::local_or_shipped};
 
 /// In each scene's folder, once it is finished: what it was made with, and how it went.
 const RECORD: &str = "scene.json";
@@ -82,26 +83,10 @@ pub fn asked(args: &Args) -> bool {
 }
 
 /// Runs the command on many scenes.
-pub fn run(args: &Args) -> Result<(), CliError> {
-    if args.validate.is_some() {
-        return Err(CliError::input("--validate: expected one scene; with several, hold photos out with --holdout"));
-    }
-    let entries = named(scenes(args)?)?;
-    let (index, count) = args.share.unwrap_or((0, 1));
-    let own: Vec<&Entry> = entries.iter().enumerate().filter(|(i, _)| i % count == index).map(|(_, e)| e).collect();
-    let device = args.sampling.device.open()?;
-    let model = args.sampling.open(&device)?;
-    let options = options(args, &model)?;
-    let before = own.iter().map(|e| recorded(&args.output.join(&e.name))).collect::<Result<Vec<_>, _>>()?;
-    if !args.restart {
-        for (entry, record) in own.iter().zip(&before) {
-            if let Some(record) = record {
-                same_options(&args.output.join(&entry.name).join(RECORD), &record.options, &options)?;
-            }
-        }
-    }
+pub fn run(args: &Args, job: &Job) -> Result<(), CliError> {
+    let Prepared { own, model, options, before } = job.together(Prepared::new(args, job))?;
     let (mut rows, mut code) = (Vec::new(), 0);
-    for (i, (entry, record)) in own.iter().zip(before).enumerate() {
+    for (i, ((number, entry), record)) in own.iter().zip(before).enumerate() {
         let begin = Instant::now();
         let failed = |error: &CliError| Row {
             scene: entry.name.clone(),
@@ -123,8 +108,15 @@ pub fn run(args: &Args) -> Result<(), CliError> {
             _ => format!("done in {:.1} s", row.seconds),
         };
         eprintln!("{}/{} {}: {line}", i + 1, own.len(), entry.name);
-        rows.push(row);
+        rows.push((*number, row));
     }
+    let rows = (rows, code);
+    let Some((rows, code)) = joined(job, rows)? else { return job.together(Ok(())) };
+    job.together(report(args, rows, code))
+}
+
+/// The table of all scenes, and the error if some failed.
+fn report(args: &Args, rows: Vec<Row>, code: u8) -> Result<(), CliError> {
     let json = serde_json::to_string_pretty(&rows).map_err(CliError::failure)?;
     let table = match args.share {
         None => "scenes.json".to_owned(),
@@ -144,6 +136,56 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         1 => Err(CliError::failure(text)),
         _ => Err(CliError::input(text)),
     }
+}
+
+/// All that is looked at before the first scene is begun.
+struct Prepared {
+    /// The scenes of this process, with their numbers in the list.
+    own: Vec<(usize, Entry)>,
+    model: Reconstructor,
+    options: BTreeMap<String, String>,
+    /// What is known of each of them from before.
+    before: Vec<Option<Record>>,
+}
+
+impl Prepared {
+    fn new(args: &Args, job: &Job) -> Result<Self, CliError> {
+        if args.validate.is_some() {
+            return Err(CliError::input(
+                "--validate: expected one scene; with several, hold photos out with --holdout",
+            ));
+        }
+        let entries = named(scenes(args)?)?;
+        let (index, count) = args.share.unwrap_or(job.share());
+        let own: Vec<(usize, Entry)> = entries.into_iter().enumerate().filter(|(i, _)| i % count == index).collect();
+        let device = job.open(args.sampling.device)?;
+        let model = args.sampling.open(&device)?;
+        let options = options(args, &model)?;
+        let before = own.iter().map(|(_, e)| recorded(&args.output.join(&e.name))).collect::<Result<Vec<_>, _>>()?;
+        if !args.restart {
+            for ((_, entry), record) in own.iter().zip(&before) {
+                if let Some(record) = record {
+                    same_options(&args.output.join(&entry.name).join(RECORD), &record.options, &options)?;
+                }
+            }
+        }
+        Ok(Self { own, model, options, before })
+    }
+}
+
+/// On rank 0 the rows of all ranks in the list's order, and the exit code: a failure of ours weighs more than input that
+/// cannot be used.
+fn joined(job: &Job, own: (Vec<(usize, Row)>, u8)) -> Result<Option<(Vec<Row>, u8)>, CliError> {
+    let mut rows = Vec::new();
+    let mut codes = Vec::new();
+    for text in gather(&*job.ranks, &serde_json::to_vec(&own).map_err(CliError::failure)?)? {
+        let (theirs, code): (Vec<(usize, Row)>, u8) = serde_json::from_slice(&text).map_err(CliError::failure)?;
+        rows.extend(theirs);
+        codes.extend((code > 0).then_some(code));
+    }
+    rows.sort_by_key(|(number, _)| *number);
+    let code = codes.into_iter().min().unwrap_or(0);
+    Ok(job.first().then(|| (rows.into_iter().map(|(_, row)| row).collect(), code)))
 }
 
 /// The scenes that the command line and the list name.

@@ -1,0 +1,177 @@
+"""Trains a tiny model under an MPI launcher in many ways and compares what comes of it: see run.sh.
+
+    python3 check.py PROGRAM FOLDER KILLS LAUNCHER...
+"""
+
+import hashlib
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+# Four lanes; two stages that differ in batch, depth and parts; objects that come and go; validation.
+CONFIG = """
+seed = 5
+model = { image_size = 16, hidden = 16, blocks = 1, heads = 2, registers = 2, gaussians_per_token = 4, time_features = 8, encoder = { kind = "patch", patch_size = 8, channels = 4 } }
+loss = { held_views = 1, input_views = [2, 2], render_size = 16, gradient_size = 16 }
+validation = { every = 10, objects = 3 }
+stage = [
+    { depth = 3, image_size = 16, batch = 8, micro_batch = 1, steps = 9 },
+    { depth = 4, image_size = 16, batch = 4, steps = %d },
+]
+
+[sample]
+steps = 1
+guidance = 1.0
+gradient_size = 16
+
+[data]
+lanes = 4
+window = 12
+fresh = 4
+workers = 1
+statistics_objects = 2
+
+[data.object]
+views = 4
+samples_per_axis = 1
+
+[data.object.cameras]
+resolution = 16
+
+[data.object.surface]
+points = 64
+"""
+STEPS, SAVE_EVERY = 20, 20
+TOLERANCE = 1e-5
+
+program, place, kills = Path(sys.argv[1]).resolve(), Path(sys.argv[2]), int(sys.argv[3])
+launcher = sys.argv[4:]
+place.mkdir(parents=True)
+# One thread per rank: this checks what comes out, not how fast.
+environment = dict(os.environ, RAYON_NUM_THREADS="1")
+
+
+def command(config, run, ranks, *options):
+    train = [program, "train", config, "-o", run, "--save-every", str(SAVE_EVERY), *options]
+    return [*launcher, "-n", str(ranks), *train] if ranks else train
+
+
+def train(config, run, ranks, *options):
+    done = subprocess.run(command(config, run, ranks, *options), capture_output=True, text=True, env=environment, timeout=300)
+    assert done.returncode == 0, (done.returncode, done.stdout, done.stderr)
+
+
+def log(run):
+    lines = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+    return [line for line in lines if "loss" in line], [line for line in lines if "validation" in line]
+
+
+def weights(run):
+    """A checksum of the averaged weights; the header before them tells how long training took."""
+    data = (run / "checkpoint.safetensors").read_bytes()
+    return hashlib.sha256(data[8 + int.from_bytes(data[:8], "little") :]).hexdigest()
+
+
+def worst(run, expected):
+    """The largest relative difference of losses and norms from another run's."""
+    found, expected = log(run)[0], log(expected)[0]
+    assert [line["step"] for line in found] == [line["step"] for line in expected], (len(found), len(expected))
+    names = ["loss", "flow", "seen", "held", "gradient_norm"]
+    pairs = [(a[name], b[name]) for a, b in zip(found, expected) for name in names]
+    return max(abs(a - b) / max(abs(b), 1e-3) for a, b in pairs)
+
+
+def saved(run):
+    return max((int(p.name[6:]) for p in run.glob("state-[0-9]*")), default=0)
+
+
+def say(what, value):
+    print(f"{what}: {value}", flush=True)
+
+
+def lives(pid):
+    """A process that has ended but was not waited for yet is dead, too."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def ranks_of(run):
+    """Processes that train in this folder, apart from the launcher."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            arguments = (folder / "cmdline").read_bytes().split(b"\0")
+        except OSError:
+            continue
+        if arguments and Path(os.fsdecode(arguments[0])).name == program.name and os.fsencode(run) in arguments:
+            if lives(folder.name):
+                found.append(int(folder.name))
+    return found
+
+
+short = place / "short.toml"
+short.write_text(CONFIG % (STEPS - 9))
+alone = place / "alone"
+train(short, alone, 0)
+for ranks in [1, 2, 4]:
+    run = place / f"ranks-{ranks}"
+    train(short, run, ranks)  # weights are compared between ranks at each state
+    difference = worst(run, alone)
+    say(f"{ranks} ranks, {STEPS} steps, largest relative difference of losses and norms", f"{difference:.1e}")
+    assert difference <= TOLERANCE
+    for a, b in zip(log(run)[1], log(alone)[1], strict=True):
+        assert abs(a["validation"]["psnr"] - b["validation"]["psnr"]) < 1e-3, (a, b)
+
+# One rank, then two, then one, then four. No time at all is one step.
+run = place / "changing"
+for ranks in [1, 1, 1, 2, 2, 2, 1, 1, 4, 4, 2]:
+    train(short, run, ranks, "--minutes", "0")
+train(short, run, 1)
+difference = worst(run, alone)
+say("1, 2, 1, 4, 2 and 1 ranks in turn, largest relative difference", f"{difference:.1e}")
+assert difference <= TOLERANCE
+
+# A number of ranks that does not divide the lanes, and another program.
+done = subprocess.run(command(short, place / "three", 3), capture_output=True, text=True, env=environment, timeout=60)
+assert "data.lanes: expected a multiple of the number of ranks, 3, found 4" in done.stderr, done.stderr
+assert done.returncode == 2 and done.stderr.count("data.lanes") == 1, (done.returncode, done.stderr)
+
+# Kills.
+long = place / "long.toml"
+long.write_text(CONFIG % (300 + 100 * kills))
+whole = place / "whole"
+train(long, whole, 2)
+run = place / "killed"
+random.seed(7)
+slowest = 0.0
+for kill in range(kills):
+    before = saved(run)
+    job = subprocess.Popen(command(long, run, 2), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=environment)
+    # At any moment after the next state, while it steps, measures or saves.
+    until = time.monotonic() + 120
+    while saved(run) <= before:
+        assert job.poll() is None and time.monotonic() < until, "it makes no progress"
+        time.sleep(0.002)
+    time.sleep(random.uniform(0, 0.3))
+    ranks = ranks_of(run)
+    assert len(ranks) == 2, ranks
+    os.kill(random.choice(ranks), signal.SIGKILL)
+    begin = time.monotonic()
+    code = job.wait(timeout=60)
+    while any(lives(rank) for rank in ranks):
+        assert time.monotonic() < begin + 60, "a rank goes on alone"
+        time.sleep(0.01)
+    seconds = time.monotonic() - begin
+    slowest = max(slowest, seconds)
+    assert code != 0 and seconds < 10, (code, seconds)
+train(long, run, 2)
+say(f"{kills} kills of a random rank, slowest end", f"{slowest:.2f} s")
+assert weights(run) == weights(whole), "other weights"
+say("weights of the killed run and of one never killed", "the same to the bit")
