@@ -7,6 +7,7 @@ use freerange::{DeviceName, EncoderPlaces, load_checkpoint, require};
 use freerange_flow::{
     batch::step_rng,
     config::TrainConfig,
+    events::Events,
     log::Log,
     trainer::{Initial, StepReport, Trainer, Validated},
 };
@@ -17,8 +18,8 @@ use crate::{error::CliError, progress::Progress, runtime::local_or_shipped};
 
 /// Train a model. Run the same command again to go on where it was stopped.
 ///
-/// Writes checkpoint.safetensors (averaged weights), log.jsonl (one line per step) and the state to go on from; with
-/// `[validation]` in the configuration also best.safetensors, the weights that measured best on other objects.
+/// Writes checkpoint.safetensors (averaged weights), log.jsonl (one line per step), the same for TensorBoard (events.out.tfevents.*, with
+/// pictures of validation samples) and the state to go on from; with `[validation]` in the configuration also best.safetensors, the weights that measured best on other objects.
 #[derive(clap::Args)]
 pub struct Args {
     /// Configuration: a file such as configs/tiny.toml, or tiny, base or paper.
@@ -71,13 +72,14 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     let initial = initial.as_ref().map(|checkpoint| Initial { checkpoint, remeasure: args.remeasure });
     let mut trainer = Trainer::open_with(config, output, initial, encoder.as_ref(), &device, |m| eprintln!("{m}"))?;
     let mut log = Log::open(&output.join("log.jsonl"), trainer.step_count())?;
+    let mut events = Events::open(output, trainer.step_count())?;
     let mut bar = Progress::new("training", total);
     while trainer.step_count() < total {
         let report = match trainer.step() {
             Ok(report) => report,
             Err(e) => {
                 // What was learned before is not lost; if it cannot be saved either, the first error is the one to tell.
-                let saved = log.sync().and_then(|()| trainer.save());
+                let saved = log.sync().and_then(|()| events.sync()).and_then(|()| trainer.save());
                 eprintln!(
                     "{}",
                     saved.map_or_else(|e| e.to_string(), |_| format!("saved step {}", trainer.step_count()))
@@ -86,9 +88,14 @@ pub fn run(args: &Args) -> Result<(), CliError> {
             }
         };
         log.add(&report)?;
+        events.scalars(report.step, "train", &report)?;
         bar.at(report.step, &line(&report));
         if let Some(validated) = trainer.validate()? {
             log.add(&validated)?;
+            events.scalars(validated.step, "validation", &validated.validation)?;
+            for (i, picture) in validated.validation.pictures.iter().enumerate() {
+                events.picture(validated.step, &format!("validation/sample {i}"), picture)?;
+            }
             let Validated { step, validation: v, best, .. } = validated;
             eprintln!(
                 "validation after {step} steps: flow {:.3} held {:.4} PSNR {:.2} dB of {} samples (best {:.2} dB after {} steps)",
@@ -98,6 +105,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         let out_of_time = args.minutes.is_some_and(|m| begin.elapsed().as_secs_f64() > 60.0 * m);
         if report.step % args.save_every == 0 || report.step == total || out_of_time {
             log.sync()?;
+            events.sync()?;
             trainer.save()?;
         }
         if out_of_time {
