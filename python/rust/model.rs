@@ -119,7 +119,8 @@ impl Model {
         sampling: Sampling,
         on_step: Option<Py<PyAny>>,
     ) -> PyResult<Made> {
-        let options = Options { frame: scene.frame, ..sampling.options(&self.model)? };
+        let mut options = sampling.options(&self.model)?;
+        options.frame = scene.frame;
         self.run(py, &scene.loaded.views, &options, scene.notes(), on_step)
     }
 }
