@@ -115,7 +115,7 @@ class Model:
         Blender's (y up, z backward). `masks`: `[v, h, w]`, bool, `uint8` or floats, white is the object; without them and without alpha
         a plain background is cut away, else poses and colours tell the object (`notes` of the result says how sure).
 
-        `seed`: an integer, or several for a list of as many samples. `up`: which way is up in the cameras' frame: "z", "y", "cameras" or a
+        `seed`: an integer, or several for a list of as many samples (drawn together, they differ in rounding from one alone). `up`: which way is up in the cameras' frame: "z", "y", "cameras" or a
         direction. `center`, `radius`: where the object is, if that is known. `on_step`: called with a `Step` after each; what it
         raises ends the work, as Ctrl-C does.
 
