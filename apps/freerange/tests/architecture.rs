@@ -75,6 +75,20 @@ const ROOMS: &[(&str, &[&str])] = &[
         &["freerange-core", "freerange-splat", "freerange-camera", "freerange-raster", "freerange-metrics"],
     ),
     ("freerange-cli", &["*"]),
+    (
+        "freerange-python",
+        &[
+            "freerange-camera",
+            "freerange-raster",
+            "freerange-scene",
+            "freerange-formats",
+            "freerange-hub",
+            "freerange",
+            // For their features alone.
+            "freerange-data",
+            "freerange-metrics",
+        ],
+    ),
 ];
 
 /// Fixes features of shared dependencies; holds no code.
@@ -84,15 +98,14 @@ const FEATURES: &str = "workspace-features";
 fn no_room_knows_what_it_must_not() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
     let mut found = BTreeMap::new();
-    for folder in ["crates", "apps"] {
-        for entry in fs::read_dir(root.join(folder)).unwrap() {
-            let Ok(text) = fs::read_to_string(entry.unwrap().path().join("Cargo.toml")) else { continue };
-            let manifest: toml::Table = toml::from_str(&text).unwrap();
-            let name = manifest["package"]["name"].as_str().unwrap().to_owned();
-            let tables = [manifest.get("dependencies"), manifest.get("build-dependencies")];
-            let own = tables.into_iter().flatten().flat_map(|t| t.as_table().unwrap().keys().cloned());
-            found.insert(name, own.filter(|d| d.starts_with("freerange")).collect::<Vec<_>>());
-        }
+    let within = |folder: &str| fs::read_dir(root.join(folder)).unwrap().map(|entry| entry.unwrap().path());
+    for folder in within("crates").chain(within("apps")).chain([root.join("python")]) {
+        let Ok(text) = fs::read_to_string(folder.join("Cargo.toml")) else { continue };
+        let manifest: toml::Table = toml::from_str(&text).unwrap();
+        let name = manifest["package"]["name"].as_str().unwrap().to_owned();
+        let tables = [manifest.get("dependencies"), manifest.get("build-dependencies")];
+        let own = tables.into_iter().flatten().flat_map(|t| t.as_table().unwrap().keys().cloned());
+        found.insert(name, own.filter(|d| d.starts_with("freerange")).collect::<Vec<_>>());
     }
     found.remove(FEATURES);
     let names: Vec<&str> = ROOMS.iter().map(|(name, _)| *name).collect();

@@ -6,6 +6,7 @@ pub mod batch;
 pub mod config;
 pub mod coupling;
 mod error;
+pub mod events;
 mod inherit;
 pub mod log;
 mod optimizer;

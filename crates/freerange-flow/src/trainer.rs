@@ -615,8 +615,8 @@ impl Trainer {
         let checkpoint = self.checkpoint(self.averaged())?;
         let stage = self.config.stage(step - 1);
         let own = validation.measure(&checkpoint, &tracked, &self.config, stage, &self.device);
-        let own = agree(&*self.ranks, own)?;
-        let figures = Figures::of(&*self.ranks, own)?;
+        let (own, pictures) = agree(&*self.ranks, own)?;
+        let figures = Figures { pictures, ..Figures::of(&*self.ranks, own)? };
         let found = Best { step, psnr: figures.psnr };
         let best = self.progress.best.filter(|best| best.psnr >= found.psnr).unwrap_or(found);
         if best == found && self.ranks.rank() == 0 {

@@ -4,10 +4,15 @@ use std::{ops::ControlFlow, sync::Arc};
 
 use burn::tensor::{Device, Tensor};
 use freerange_build::psnr_over_white;
-use freerange_camera::View;
+use freerange_camera::{
+    View,
+    image_ops::{composite, sheet, to_picture},
+};
 use freerange_data::{Object, ObjectSource};
 use freerange_model::{Checkpoint, FreeRange, ModelConfig};
+use freerange_raster::{RasterConfig, render};
 use freerange_splat::{Cloud, channel};
+use image::RgbaImage;
 
 use crate::{
     FlowError,
@@ -48,6 +53,9 @@ pub struct Figures {
     pub psnr: f64,
     /// Samples that is the mean of.
     pub samples: usize,
+    /// Of the first samples: other views of the object above the same of the sample.
+    #[serde(skip)]
+    pub pictures: Vec<RgbaImage>,
 }
 
 /// The objects to measure on.
@@ -114,12 +122,26 @@ impl Figures {
         let psnr: Vec<f64> = all.iter().flat_map(|m| m.psnr.iter().copied()).collect();
         let mut sum = 0.0;
         psnr.iter().for_each(|x| sum += x);
-        Ok(Self { flow, seen, held, psnr: sum / psnr.len() as f64, samples: psnr.len() })
+        Ok(Self { flow, seen, held, psnr: sum / psnr.len() as f64, samples: psnr.len(), pictures: Vec::new() })
     }
 }
 
 /// Views of an object that samples are compared with, at most.
 const COMPARED: usize = 8;
+/// Samples that there are pictures of, at most, and views on each.
+const PICTURED: (usize, usize) = (4, 4);
+
+/// The first views of an object above the same of a sample, over white.
+fn picture(sample: &Cloud, views: &[View]) -> Result<RgbaImage, FlowError> {
+    const WHITE: [f32; 3] = [1.0; 3];
+    let (mut truth, mut renders) = (Vec::new(), Vec::new());
+    for View { camera, image, .. } in views.iter().take(PICTURED.1) {
+        truth.push(to_picture(&composite(image, WHITE), camera.width, camera.height));
+        let render = render(sample.rows(), &[*camera], &[WHITE], &RasterConfig::default())?;
+        renders.push(to_picture(&render.rgb, camera.width, camera.height));
+    }
+    Ok(sheet(&[truth, renders]))
+}
 
 impl Validation {
     /// Takes a rank's share of the first `count` of `available` objects of `source`.
@@ -143,11 +165,11 @@ impl Validation {
         config: &TrainConfig,
         stage: &Stage,
         device: &Device,
-    ) -> Result<Vec<Measured>, FlowError> {
+    ) -> Result<(Vec<Measured>, Vec<RgbaImage>), FlowError> {
         let photometric = Photometric::new(&checkpoint.normalization, device);
         let rms = Tensor::<1>::from_floats(checkpoint.gradient_rms, device).reshape([1, 1, channel::COUNT]);
         let model_config = ModelConfig { image_size: stage.image_size, ..config.model.clone() };
-        let mut measured = Vec::new();
+        let (mut measured, mut pictures) = (Vec::new(), Vec::new());
         for (number, object) in &self.objects {
             // Times, noise and views are the same every time.
             let mut rng = step_rng(self.seed, *number);
@@ -168,10 +190,13 @@ impl Validation {
                     ControlFlow::Continue(())
                 })?;
                 psnr.push(psnr_over_white(&found[0][0], &others)?);
+                if pictures.len() < PICTURED.0 {
+                    pictures.push(picture(&found[0][0], &others)?);
+                }
             }
             measured.push(Measured { object: *number, losses: [flow, seen, held], psnr });
         }
-        Ok(measured)
+        Ok((measured, pictures))
     }
 
     /// Input views, views to compare with, and the fit to start from: each of the object's fits where sampling starts from

@@ -14,4 +14,4 @@ mod network;
 pub mod read;
 
 pub use error::SceneError;
-pub use load::{LoadConfig, Loaded, MaskKind, MaskModel, MaskSource, PixelRange, files, load, up_of, write_masks};
+pub use load::{LoadConfig, Loaded, MaskKind, MaskModel, MaskSource, PixelRange, cut, files, load, up_of, write_masks};

@@ -187,13 +187,8 @@ pub fn load(cameras: &Cameras, config: &LoadConfig) -> Result<Loaded, SceneError
         let found = format!("all {} cameras stand at one point; expected views from different places", views.len());
         return Err(In(&file).malformed("", found));
     }
-    let (kind, estimate) = cut_all(&mut views, &pictures, config, &mut notes)?;
-    for view in &views {
-        if view.image.pixels().all(|p| p[3] < 128) {
-            let expected = "a mask that shows the object".into();
-            return Err(SceneError::Mask { name: view.name.clone(), expected, found: "one that is empty".into() });
-        }
-    }
+    let told: Vec<Told<'_>> = pictures.iter().map(|p| Told { mask: p.mask.as_ref(), alpha: p.alpha }).collect();
+    let (kind, estimate) = cut_all(&mut views, &told, config, &mut notes)?;
     let further = further
         .par_iter()
         .map(|i| {
@@ -239,16 +234,50 @@ fn plain(view: &View) -> Result<RgbaImage, SceneError> {
     })
 }
 
+/// Cuts the object out of views that are in memory, as [`load`] does by default: those with transparency keep it, a plain background is
+/// cut away; where neither is there, poses and colours tell. Returns what was done, for the user to read.
+pub fn cut(views: &mut [View], hints: &Hints) -> Result<Vec<String>, SceneError> {
+    let alpha: Vec<bool> = views.iter().map(|v| !opaque(&v.image)).collect();
+    let told: Vec<Told<'_>> = alpha.into_iter().map(|alpha| Told { mask: None, alpha }).collect();
+    let mut notes = Vec::new();
+    cut_all(views, &told, &LoadConfig { hints: *hints, ..LoadConfig::default() }, &mut notes)?;
+    Ok(notes)
+}
+
+/// What a picture itself says of the object.
+struct Told<'a> {
+    mask: Option<&'a GrayImage>,
+    /// As [`Picture::alpha`].
+    alpha: bool,
+}
+
 /// Gives the views their masks.
 fn cut_all(
     views: &mut [View],
-    pictures: &[Picture],
+    told: &[Told<'_>],
     config: &LoadConfig,
     notes: &mut Vec<String>,
 ) -> Result<(MaskKind, Option<Estimate>), SceneError> {
-    if pictures.iter().all(|p| p.mask.is_some()) {
-        for (view, picture) in views.iter_mut().zip(pictures) {
-            if let Some(mask) = &picture.mask {
+    let found = mask_all(views, told, config, notes)?;
+    match views.iter().find(|view| view.image.pixels().all(|p| p[3] < 128)) {
+        None => Ok(found),
+        Some(view) => {
+            let expected = "a mask that shows the object".into();
+            Err(SceneError::Mask { name: view.name.clone(), expected, found: "one that is empty".into() })
+        }
+    }
+}
+
+/// [`cut_all`], whatever the masks show.
+fn mask_all(
+    views: &mut [View],
+    told: &[Told<'_>],
+    config: &LoadConfig,
+    notes: &mut Vec<String>,
+) -> Result<(MaskKind, Option<Estimate>), SceneError> {
+    if told.iter().all(|p| p.mask.is_some()) {
+        for (view, picture) in views.iter_mut().zip(told) {
+            if let Some(mask) = picture.mask {
                 set_alpha(&mut view.image, mask.as_raw());
             }
         }
@@ -266,10 +295,10 @@ fn cut_all(
     let auto = config.masks == MaskSource::Auto;
     if config.masks != MaskSource::Estimate {
         // Alpha where there is one, else a plain background.
-        let with_alpha = pictures.iter().filter(|p| p.alpha).count();
+        let with_alpha = told.iter().filter(|p| p.alpha).count();
         let tried: Result<Vec<Option<RgbaImage>>, SceneError> = views
             .par_iter()
-            .zip(pictures)
+            .zip(told)
             .map(|(view, picture)| match (picture.alpha, &config.masks) {
                 (true, MaskSource::Auto | MaskSource::Alpha) => Ok(None),
                 (false, MaskSource::Alpha) => Err(SceneError::Mask {

@@ -65,6 +65,17 @@ pub enum Error {
 }
 
 impl Error {
+    /// Whether a device or the arithmetic failed; everything else is about what was given.
+    pub fn is_failure(&self) -> bool {
+        matches!(
+            self,
+            Self::Cancelled
+                | Self::BrokenDevice(_)
+                | Self::Fit(freerange_fit::FitError::Diverged { .. })
+                | Self::Flow(FlowError::NotFinite { .. } | FlowError::NoGradient | FlowError::Cancelled)
+        )
+    }
+
     pub(crate) fn input(field: impl Into<String>, expected: impl Into<String>, found: impl ToString) -> Self {
         Self::Input { field: field.into(), expected: expected.into(), found: found.to_string() }
     }

@@ -12,6 +12,7 @@ use freerange_flow::{
     FlowError,
     batch::step_rng,
     config::TrainConfig,
+    events::Events,
     log::Log,
     trainer::{Among, Initial, StepReport, Trainer, Validated},
 };
@@ -27,9 +28,10 @@ use crate::{
 
 /// Train a model. Run the same command again to go on where it was stopped.
 ///
-/// Writes checkpoint.safetensors (averaged weights), log.jsonl (one line per step) and the state to go on from; with
-/// `[validation]` in the configuration also best.safetensors, the weights that measured best on other objects.
-/// Built with `--features mpi` and started as several processes by mpirun or srun, these train one model together.
+/// Writes checkpoint.safetensors (averaged weights), log.jsonl (one line per step), the same for TensorBoard (events.out.tfevents.*, with
+/// pictures of validation samples) and the state to go on from; with `[validation]` in the configuration also best.safetensors, the
+/// weights that measured best on other objects. Built with `--features mpi` and started as several processes by mpirun or srun, these
+/// train one model together.
 #[derive(clap::Args)]
 pub struct Args {
     /// Configuration: a file such as configs/tiny.toml, or tiny, base or paper.
@@ -110,10 +112,9 @@ fn train(args: &Args, job: &Job, begin: Instant) -> Result<(), CliError> {
     if let Some(time) = allowed.and_then(|allowed| begin.checked_add(allowed)) {
         trainer.stop_at(time);
     }
-    let log = || Log::open(&output.join("log.jsonl"), trainer.step_count()).map_err(CliError::from);
     // Rank 0 speaks and writes for all.
-    let mut log = job.together(if job.first() { log().map(Some) } else { Ok(None) })?;
-    let mut bar = job.first().then(|| Progress::new("training", total));
+    let journal = || Journal::open(output, trainer.step_count(), total).map_err(CliError::from);
+    let mut journal = job.together(if job.first() { journal().map(Some) } else { Ok(None) })?;
     while trainer.step_count() < total {
         let report = match trainer.step() {
             Ok(report) => report,
@@ -121,40 +122,75 @@ fn train(args: &Args, job: &Job, begin: Instant) -> Result<(), CliError> {
             Err(e @ FlowError::Ranks { .. }) => return Err(e.into()),
             Err(e) => {
                 // What was learned before is not lost; if it cannot be saved either, the first error is the one to tell.
-                let synced = log.as_mut().map_or(Ok(()), Log::sync);
+                let synced = journal.as_mut().map_or(Ok(()), Journal::sync);
                 let saved = trainer.save();
                 let saved = synced.and(saved);
                 say(&saved.map_or_else(|e| e.to_string(), |_| format!("saved step {}", trainer.step_count())));
                 return job.together(Err(e.into()));
             }
         };
-        if let (Some(log), Some(bar)) = (&mut log, &mut bar) {
-            log.add(&report)?;
-            bar.at(report.step, &line(&report));
+        if let Some(journal) = &mut journal {
+            journal.step(&report)?;
         }
         if let Some(validated) = trainer.validate()?
-            && let Some(log) = &mut log
+            && let Some(journal) = &mut journal
         {
-            log.add(&validated)?;
-            let Validated { step, validation: v, best, .. } = validated;
-            eprintln!(
-                "validation after {step} steps: flow {:.3} held {:.4} PSNR {:.2} dB of {} samples (best {:.2} dB after {} steps)",
-                v.flow, v.held, v.psnr, v.samples, best.psnr, best.step
-            );
+            journal.validated(&validated)?;
         }
         if report.step % args.save_every == 0 || report.step == total || report.out_of_time {
-            log.as_mut().map_or(Ok(()), Log::sync)?;
+            journal.as_mut().map_or(Ok(()), Journal::sync)?;
             trainer.save()?;
         }
         if report.out_of_time {
             break;
         }
     }
-    if let Some(bar) = bar {
+    if let Some(Journal { bar, .. }) = journal {
         bar.finish();
         println!("{} of {total} steps; {}", trainer.step_count(), output.join("checkpoint.safetensors").display());
     }
     Ok(())
+}
+
+/// What a run tells: on the terminal, in log.jsonl, to TensorBoard.
+struct Journal {
+    log: Log,
+    events: Events,
+    bar: Progress,
+}
+
+impl Journal {
+    /// That of a run in `folder` which is at `step` of `total`.
+    fn open(folder: &Path, step: u64, total: u64) -> Result<Self, FlowError> {
+        let log = Log::open(&folder.join("log.jsonl"), step)?;
+        Ok(Self { log, events: Events::open(folder, step)?, bar: Progress::new("training", total) })
+    }
+
+    fn step(&mut self, report: &StepReport) -> Result<(), FlowError> {
+        self.log.add(report)?;
+        self.events.scalars(report.step, "train", report)?;
+        self.bar.at(report.step, &line(report));
+        Ok(())
+    }
+
+    fn validated(&mut self, validated: &Validated) -> Result<(), FlowError> {
+        self.log.add(validated)?;
+        let Validated { step, validation: v, best, .. } = validated;
+        self.events.scalars(*step, "validation", v)?;
+        for (i, picture) in v.pictures.iter().enumerate() {
+            self.events.picture(*step, &format!("validation/sample {i}"), picture)?;
+        }
+        eprintln!(
+            "validation after {step} steps: flow {:.3} held {:.4} PSNR {:.2} dB of {} samples (best {:.2} dB after {} steps)",
+            v.flow, v.held, v.psnr, v.samples, best.psnr, best.step
+        );
+        Ok(())
+    }
+
+    fn sync(&mut self) -> Result<(), FlowError> {
+        self.log.sync()?;
+        self.events.sync()
+    }
 }
 
 /// What has to be the same on all ranks, besides what the trainer compares itself.

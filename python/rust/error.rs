@@ -1,0 +1,66 @@
+//! Errors as Python's own.
+
+use std::error::Error;
+
+use freerange_formats::FormatError;
+use freerange_hub::HubError;
+use freerange_raster::RasterError;
+use freerange_scene::SceneError;
+use pyo3::{
+    PyErr,
+    exceptions::{PyOSError, PyRuntimeError, PyValueError},
+};
+
+/// An error with its causes, each told once.
+fn told(error: &(dyn Error + 'static)) -> String {
+    let mut last = error.to_string();
+    let mut text = last.clone();
+    let mut cause = error.source();
+    while let Some(e) = cause {
+        let next = e.to_string();
+        if !last.contains(&next) {
+            text += &format!(": {next}");
+            last = next;
+        }
+        cause = e.source();
+    }
+    text
+}
+
+/// `OSError` where the system refused a file, else `ValueError`.
+fn about_input(error: &(dyn Error + 'static)) -> PyErr {
+    let mut next = Some(error);
+    while let Some(e) = next {
+        if let Some(io) = e.downcast_ref::<std::io::Error>() {
+            return match io.raw_os_error() {
+                // With a number Python chooses the subclass: FileNotFoundError, PermissionError, ...
+                Some(number) => PyOSError::new_err((number, told(error))),
+                None => PyOSError::new_err(told(error)),
+            };
+        }
+        next = e.source();
+    }
+    PyValueError::new_err(told(error))
+}
+
+/// What the caller gave is to blame (`ValueError`, `OSError`), or a device or the arithmetic (`RuntimeError`).
+pub fn of_model(error: freerange::Error) -> PyErr {
+    if error.is_failure() { PyRuntimeError::new_err(told(&error)) } else { about_input(&error) }
+}
+
+/// A name that is none, else what lies between here and the hub.
+pub fn of_hub(error: HubError) -> PyErr {
+    match error {
+        HubError::Name { .. } => about_input(&error),
+        _ => PyOSError::new_err(told(&error)),
+    }
+}
+
+macro_rules! about_input {
+    ($($name:ident($error:ty))*) => {$(
+        pub fn $name(error: $error) -> PyErr {
+            about_input(&error)
+        }
+    )*};
+}
+about_input!(of_format(FormatError) of_raster(RasterError) of_scene(SceneError));

@@ -1,0 +1,82 @@
+//! The rasteriser: forward, backward, and the slow one that tests compare with.
+
+use freerange::Camera;
+use freerange_raster::{RasterConfig, RenderOutput, reference as slow, render, render_backward};
+use pyo3::{prelude::*, pybacked::PyBackedBytes, types::PyByteArray};
+
+use crate::{
+    arguments::{RawCamera, camera, cameras, floats},
+    error::of_raster,
+};
+
+/// The bytes of numbers, for NumPy to wrap.
+pub fn bytes(py: Python<'_>, values: &[f32]) -> Py<PyByteArray> {
+    let bytes: Vec<u8> = values.iter().flat_map(|v| v.to_ne_bytes()).collect();
+    PyByteArray::new(py, &bytes).unbind()
+}
+
+/// As [`bytes`].
+fn doubles(py: Python<'_>, values: &[f64]) -> Py<PyByteArray> {
+    let bytes: Vec<u8> = values.iter().flat_map(|v| v.to_ne_bytes()).collect();
+    PyByteArray::new(py, &bytes).unbind()
+}
+
+/// Pictures, and what their gradient needs.
+#[pyclass(frozen)]
+pub struct Rendered {
+    rows: Vec<f32>,
+    output: RenderOutput,
+}
+
+/// Renders rows of 14 channels from every camera.
+#[pyfunction]
+pub fn rasterize(
+    py: Python<'_>,
+    rows: PyBackedBytes,
+    raw: Vec<RawCamera>,
+    backgrounds: Vec<[f32; 3]>,
+) -> PyResult<Rendered> {
+    let rows = floats("gaussians", &rows)?;
+    let cameras: Vec<Camera> = cameras(raw)?;
+    let output = py.detach(|| render(&rows, &cameras, &backgrounds, &RasterConfig::default())).map_err(of_raster)?;
+    Ok(Rendered { rows, output })
+}
+
+#[pymethods]
+impl Rendered {
+    /// `[views, h, w, 3]`
+    fn rgb(&self, py: Python<'_>) -> Py<PyByteArray> {
+        bytes(py, &self.output.rgb)
+    }
+
+    /// `[views, h, w]`
+    fn alpha(&self, py: Python<'_>) -> Py<PyByteArray> {
+        bytes(py, &self.output.alpha)
+    }
+
+    /// d loss / d rgb and d loss / d alpha to d loss / d rows and d loss / d backgrounds.
+    fn backward(
+        &self,
+        py: Python<'_>,
+        d_rgb: PyBackedBytes,
+        d_alpha: PyBackedBytes,
+    ) -> PyResult<(Py<PyByteArray>, Py<PyByteArray>)> {
+        let (d_rgb, d_alpha) = (floats("d_rgb", &d_rgb)?, floats("d_alpha", &d_alpha)?);
+        let gradients = py.detach(|| render_backward(&self.rows, &self.output, &d_rgb, &d_alpha, &[]));
+        let gradients = gradients.map_err(of_raster)?;
+        Ok((bytes(py, &gradients.gaussians), bytes(py, gradients.backgrounds.as_flattened())))
+    }
+}
+
+/// One view by the rasteriser's slow, obvious form in double precision: colour and alpha. For tests.
+#[pyfunction]
+pub fn reference(
+    py: Python<'_>,
+    rows: PyBackedBytes,
+    raw: RawCamera,
+    background: [f32; 3],
+) -> PyResult<(Py<PyByteArray>, Py<PyByteArray>)> {
+    let (rows, camera) = (floats("gaussians", &rows)?, camera(0, raw)?);
+    let image = py.detach(|| slow::render(&rows, &camera, background, &RasterConfig::default()));
+    Ok((doubles(py, &image.rgb), doubles(py, &image.alpha)))
+}

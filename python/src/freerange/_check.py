@@ -1,0 +1,168 @@
+"""Arguments, checked field by field: what is wrong is said with the field, what was expected and what was found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Union
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[Any]
+Floats = npt.NDArray[np.float32]
+RawCamera = tuple[int, int, tuple[float, ...], list[list[float]]]
+Up = Union[str, tuple[float, float, float]]
+
+CONVENTIONS = ("opencv", "opengl")
+# OpenGL's cameras have y up and z backward.
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def refuse(field: str, expected: str, found: object) -> ValueError:
+    return ValueError(f"{field}: expected {expected}, found {found}")
+
+
+def wrong_type(field: str, expected: str, found: object) -> TypeError:
+    return TypeError(f"{field}: expected {expected}, found {found}")
+
+
+def array(field: str, value: Any, kinds: str = "iuf", expected: str = "numbers") -> Array:
+    """An array of one of these kinds of element."""
+    try:
+        found = np.asarray(value)
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise wrong_type(field, f"an array of {expected}", f"{type(value).__name__} ({error})") from None
+    if found.dtype.kind not in kinds:
+        raise wrong_type(field, f"an array of {expected}", f"{type(value).__name__} of {found.dtype}")
+    return found
+
+
+def shaped(field: str, value: Any, shape: tuple[int | None, ...], names: str) -> Array:
+    """An array of finite numbers of this shape; `None` is any length."""
+    found = array(field, value)
+    if found.ndim != len(shape) or any(e is not None and e != f for e, f in zip(shape, found.shape)):
+        raise refuse(field, f"the shape {names}", list(found.shape))
+    finite(field, found)
+    return found
+
+
+def finite(field: str, found: Array) -> None:
+    if found.dtype.kind == "f" and not np.isfinite(found).all():
+        at = np.unravel_index(int(np.argmin(np.isfinite(found))), found.shape)
+        raise refuse(f"{field}[{', '.join(map(str, at))}]", "a finite number", found[at])
+
+
+def count(field: str, value: Any, least: int, most: int | None = None) -> int:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        raise wrong_type(field, "an integer", f"{value!r}")
+    if value < least or (most is not None and value > most):
+        expected = f"at least {least}" if most is None else f"{least} to {most}"
+        raise refuse(field, expected, value)
+    return int(value)
+
+
+def number(field: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+        raise wrong_type(field, "a number", f"{value!r}")
+    if not np.isfinite(value):
+        raise refuse(field, "a finite number", value)
+    return float(value)
+
+
+def point(field: str, value: Any) -> tuple[float, float, float]:
+    x, y, z = shaped(field, value, (3,), "[3]").tolist()
+    return (float(x), float(y), float(z))
+
+
+def up(value: Any) -> Up:
+    return value if isinstance(value, str) else point("up", value)
+
+
+def color(field: str, value: Any, views: int) -> list[tuple[float, float, float]]:
+    """One colour for all views, or one for each."""
+    found = array(field, value)
+    if found.shape not in ((), (3,), (views, 3)):
+        raise refuse(field, f"a number, the shape [3] or [{views}, 3]", list(found.shape))
+    finite(field, found)
+    return [tuple(row) for row in np.broadcast_to(found, (views, 3)).astype(np.float64).tolist()]
+
+
+def cameras(
+    c2w: Any, intrinsics: Any, sizes: Sequence[tuple[int, int]], convention: str, k_name: str
+) -> list[RawCamera]:
+    """Cameras of images of these widths and heights, as the part in Rust takes them."""
+    if convention not in CONVENTIONS:
+        raise refuse("convention", " or ".join(map(repr, CONVENTIONS)), f"{convention!r}")
+    views = len(sizes)
+    k = shaped(k_name, intrinsics, (views, 3, 3), f"[{views}, 3, 3]").astype(np.float64)
+    poses = array("c2w", c2w)
+    if poses.shape not in ((views, 4, 4), (views, 3, 4)):
+        raise refuse("c2w", f"the shape [{views}, 4, 4] or [{views}, 3, 4]", list(poses.shape))
+    finite("c2w", poses)
+    poses = poses.astype(np.float64)
+    if poses.shape[1] == 3:
+        last = np.broadcast_to(np.array([0.0, 0.0, 0.0, 1.0]), (views, 1, 4))
+        poses = np.concatenate([poses, last], axis=1)
+    if convention == "opengl":
+        poses = poses @ _FLIP
+    raw: list[RawCamera] = []
+    for i, (width, height) in enumerate(sizes):
+        (fx, skew, cx), (zero, fy, cy), last = k[i].tolist()
+        field = f"{k_name}[{i}]"
+        if skew != 0.0 or zero != 0.0 or last != [0.0, 0.0, 1.0]:
+            raise refuse(field, "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", k[i].tolist())
+        if fx <= 0.0 or fy <= 0.0:
+            raise refuse(field, "focal lengths above 0", f"{fx} and {fy}")
+        raw.append((width, height, (fx, fy, cx, cy), poses[i].tolist()))
+    return raw
+
+
+def _listed(field: str, value: Any, names: str) -> list[Any]:
+    """An array's first axis, or a sequence."""
+    if isinstance(value, (str, bytes)) or not hasattr(value, "__len__") or not hasattr(value, "__getitem__"):
+        raise wrong_type(field, f"an array {names} or a sequence of arrays", type(value).__name__)
+    return [value[i] for i in range(len(value))]
+
+
+def _bytes(field: str, found: Array) -> npt.NDArray[np.uint8]:
+    """8 bits, of these or of floats from 0 to 1."""
+    if found.dtype == np.uint8:
+        return found
+    if found.dtype.kind == "b":
+        return found.astype(np.uint8) * np.uint8(255)
+    if found.dtype.kind != "f":
+        raise wrong_type(field, "uint8, or floats from 0 to 1", found.dtype)
+    finite(field, found)
+    low, high = (float(found.min()), float(found.max())) if found.size else (0.0, 0.0)
+    # What resampling in float32 leaves of 0 and 1.
+    if low < -1e-5 or high > 1.0 + 1e-5:
+        raise refuse(field, "floats from 0 to 1 (or uint8)", f"{low:g} to {high:g}")
+    return np.rint(np.clip(found, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+def images(value: Any, masks: Any) -> list[npt.NDArray[np.uint8]]:
+    """RGBA of 8 bits, each `[h, w, 4]`; opaque where nothing tells the object."""
+    listed = _listed("images", value, "[v, h, w, 3 or 4]")
+    if len(listed) < 2:
+        raise refuse("images", "at least 2", len(listed))
+    outlines: list[Any] = [None] * len(listed)
+    if masks is not None:
+        outlines = _listed("masks", masks, "[v, h, w]")
+        if len(outlines) != len(listed):
+            raise refuse("masks", f"one for each of {len(listed)} images", len(outlines))
+    result = []
+    for i, (one, outline) in enumerate(zip(listed, outlines)):
+        found = array(f"images[{i}]", one, expected="uint8, or floats from 0 to 1")
+        if found.ndim != 3 or found.shape[2] not in (3, 4) or 0 in found.shape:
+            raise refuse(f"images[{i}]", "the shape [h, w, 3] or [h, w, 4]", list(found.shape))
+        rgba = np.full((*found.shape[:2], 4), 255, dtype=np.uint8)
+        rgba[..., : found.shape[2]] = _bytes(f"images[{i}]", found)
+        if outline is not None:
+            mask = array(f"masks[{i}]", outline, "biuf", "bool, uint8, or floats from 0 to 1")
+            if mask.shape != found.shape[:2]:
+                raise refuse(f"masks[{i}]", f"the shape {list(found.shape[:2])} of its image", list(mask.shape))
+            share = _bytes(f"masks[{i}]", mask).astype(np.uint16)
+            rgba[..., 3] = rgba[..., 3] * share // 255
+            rgba[rgba[..., 3] == 0] = 0
+        result.append(rgba)
+    return result

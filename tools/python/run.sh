@@ -1,0 +1,48 @@
+#!/usr/bin/env bash
+# The Python package in an environment of its own: it is built and installed by pip; types; tests, the README's five lines, gradients through PyTorch, TensorBoard's reader
+# and the notebook among them; every step in a file of Rerun's; and the time of a reconstruction beside the command line's. Says what it leaves out where packages cannot be had.
+#
+#     tools/python/run.sh target/release/freerange [FEATURES]
+#
+# FEATURES of the build: `as-tests` lets it use what the workspace's tests have built. TORCH=no leaves out PyTorch (3 GB) and what needs it, RERUN=no Rerun.
+set -euo pipefail
+FREERANGE=$(realpath "$1")
+export FREERANGE
+features=${2:-}
+cd "$(dirname "$0")/../.."
+leave() {
+  echo "LEFT OUT: the Python package: $*"
+  exit 0
+}
+python=${PYTHON:-python3}
+"$python" -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null || leave "no Python of version 3.10 or later"
+folder=$(mktemp -d)
+trap 'rm -rf "$folder"' EXIT
+{ "$python" -m venv "$folder/venv" && "$folder/venv/bin/pip" install -q 'maturin>=1.9,<2'; } || leave "no packages from PyPI"
+pip() { "$folder/venv/bin/pip" --disable-pip-version-check "$@"; }
+# Mesa's software Vulkan and PyTorch's Triton bring an LLVM each and crash in one process: no driver is to be found here.
+export VK_DRIVER_FILES=/nonexistent VK_ICD_FILENAMES=/nonexistent
+export CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-$PWD/target}
+begin=$SECONDS
+pip install -q './python[test]' ${features:+--config-settings="build-args=--features $features"}
+echo "installed in $((SECONDS - begin)) s: $(cd / && "$folder/venv/bin/python" -c 'import freerange; print(freerange.__version__, freerange.__file__)')"
+without=()
+if [ "${TORCH:-yes}" = no ] || ! pip install -q torch; then
+  echo "LEFT OUT: PyTorch, and gradients through it"
+  without+=(--ignore=tests/test_torch.py)
+fi
+(cd python && "$folder/venv/bin/mypy" --python-executable "$folder/venv/bin/python")
+(cd python && "$folder/venv/bin/python" -m pytest -q -p no:cacheprovider "${without[@]}")
+(cd python && "$folder/venv/bin/python" -m pytest -q -p no:cacheprovider --nbmake --nbmake-timeout=600 examples)
+if [ "${RERUN:-yes}" = no ] || ! pip install -q rerun-sdk; then
+  echo "LEFT OUT: the example for Rerun"
+else
+  "$folder/venv/bin/python" python/examples/rerun_steps.py examples/bowl "$folder/steps.rrd"
+  # Without its analytics, and without a trace in the user's settings.
+  for arguments in "analytics disable" "rrd verify $folder/steps.rrd"; do
+    # shellcheck disable=SC2086
+    XDG_CONFIG_HOME=$folder XDG_DATA_HOME=$folder "$folder/venv/bin/rerun" $arguments >"$folder/rerun.txt" 2>&1 || { cat "$folder/rerun.txt" && exit 1; }
+  done
+  echo "Rerun's file: $(stat -c %s "$folder/steps.rrd") bytes"
+fi
+"$folder/venv/bin/python" tools/python/times.py "$FREERANGE" examples/bowl
