@@ -145,7 +145,7 @@ assert done.returncode == 2 and done.stderr.count("data.lanes") == 1, (done.retu
 
 # Kills.
 long = place / "long.toml"
-long.write_text(CONFIG % (300 + 100 * kills))
+long.write_text(CONFIG % (120 + 60 * kills))
 whole = place / "whole"
 train(long, whole, 2)
 run = place / "killed"
