@@ -20,8 +20,8 @@ folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 { "$python" -m venv "$folder/venv" && "$folder/venv/bin/pip" install -q 'maturin>=1.9,<2'; } || leave "no packages from PyPI"
 pip() { "$folder/venv/bin/pip" --disable-pip-version-check "$@"; }
-# Mesa's software Vulkan and PyTorch's Triton bring an LLVM each and crash in one process: no driver is to be found here.
-export VK_DRIVER_FILES=/nonexistent VK_ICD_FILENAMES=/nonexistent
+# Mesa's software Vulkan and OpenGL and PyTorch's Triton bring an LLVM each and crash in one process: no driver is to be found here.
+export VK_DRIVER_FILES=/nonexistent VK_ICD_FILENAMES=/nonexistent __EGL_VENDOR_LIBRARY_FILENAMES=/nonexistent
 export CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-$PWD/target}
 begin=$SECONDS
 pip install -q './python[test]' ${features:+--config-settings="build-args=--features $features"}
