@@ -309,8 +309,15 @@ fn evaluation(views: &[View], config: &BuildConfig, seed: u64) -> Result<Option<
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 enum Outcome {
     #[serde(rename = "made")]
-    Built { split: Split, psnr: Option<f64>, flagged: bool, statistics: BTreeMap<u32, Statistics> },
-    Failed { reason: String },
+    Built {
+        split: Split,
+        psnr: Option<f64>,
+        flagged: bool,
+        statistics: BTreeMap<u32, Statistics>,
+    },
+    Failed {
+        reason: String,
+    },
 }
 
 /// Sums over the objects made now.

@@ -84,8 +84,7 @@ pub fn measure_quality(item: &Item, config: &BuildConfig, counts: &[usize]) -> R
     let surface = surface_gaussians(&photographed.scene, &points, &mut photographed.rng);
     let surface = LodTree::build_to_depth(&surface, deepest, object.alignment)?;
     let by_count = counts.iter().map(|&gaussians| {
-        let fit =
-            FitConfig { cap_max: gaussians, initial: object.fit.initial.min(gaussians), ..object.fit.clone() };
+        let fit = FitConfig { cap_max: gaussians, initial: object.fit.initial.min(gaussians), ..object.fit.clone() };
         let (_, fit, fit_seconds) = timed(&mut photographed, fit)?;
         let slice = tree.slice(gaussians.ilog2())?;
         let polished = match object.polish {

@@ -1,8 +1,8 @@
 //! Plücker coordinates and view selection against committed vectors.
 
 use freerange_camera::{Camera, PatchLayout, SelectionConfig, k_means, plucker, select_views};
-use glam::{DMat4, DVec3};
 use freerange_vectors::{Vectors, json};
+use glam::{DMat4, DVec3};
 use rand::SeedableRng;
 
 #[test]

@@ -117,7 +117,12 @@ fn euler_with_both_guidances_on_the_toy_model() {
         assert_close(&format!("{name}: trajectory"), &trajectory, &expected[..trajectory.len()], 1e-4);
         assert_close(&format!("{name}: estimates"), &estimates, v.floats("out/zhat_guided"), 1e-4);
         let rows = values(last).len();
-        assert_close("last", &estimates[estimates.len() - rows..], v.floats("out/zhat_guided")[estimates.len() - rows..], 1e-4);
+        assert_close(
+            "last",
+            &estimates[estimates.len() - rows..],
+            v.floats("out/zhat_guided")[estimates.len() - rows..],
+            1e-4,
+        );
     }
 }
 

@@ -3,10 +3,7 @@
 
 use freerange_scene::{LoadConfig, MaskKind, MaskModel, MaskSource, PixelRange, load, read::cameras};
 use serde_json::json;
-use std::{
-    collections::BTreeMap,
-    path::PathBuf,
-};
+use std::{collections::BTreeMap, path::PathBuf};
 
 fn golden(name: &str) -> PathBuf {
     freerange_vectors::path("mask_network").join(name)

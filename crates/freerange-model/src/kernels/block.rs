@@ -67,7 +67,7 @@ pub(crate) struct Saved<B: Backend> {
     normed_f: FloatTensor<B>, // [b, q, d]
     inner: Product<B>,        // [b, q, 2 f]
     hidden: FloatTensor<B>,   // [b, q, f]
-    down: Product<B>,          // [b, q, d]
+    down: Product<B>,         // [b, q, d]
 }
 
 /// Part `i` of `n` of the last axis of `[b, n d]`.

@@ -129,7 +129,8 @@ pub fn sample(
     let (z, gradient) = (normal(branches * b), normal(branches * b));
     let t = Tensor::<1>::full([branches * b], 0.5, device);
     let gradient = model_config.gradient_channels.then_some(gradient);
-    let transformer_seconds = timer.time(|| Ok(model.denoise(z.clone(), gradient.clone(), tokens.clone(), t.clone())))?;
+    let transformer_seconds =
+        timer.time(|| Ok(model.denoise(z.clone(), gradient.clone(), tokens.clone(), t.clone())))?;
     let photometric = Photometric::new(&checkpoint.normalization, device);
     let start = normal(b);
     let gradient_at = |size: u32| {

@@ -88,7 +88,12 @@ pub fn product([m, k, n]: [usize; 3], a: Matrix, b: Matrix, bias: Option<&[f32]>
                         // SAFETY: this task alone writes these rows, all within `out`; what it reads, it has written.
                         unsafe {
                             let out = target.at(row * n + column);
-                            unit.multiply(left_tiles, right_tiles, start, Destination { out, stride: n, rows, columns });
+                            unit.multiply(
+                                left_tiles,
+                                right_tiles,
+                                start,
+                                Destination { out, stride: n, rows, columns },
+                            );
                         }
                     }
                 }
