@@ -50,7 +50,7 @@ pub(crate) fn adapted(
         cap_max: slice.len(),
         initial: slice.len(),
         growth_start: usize::MAX,
-        noise: 0.0,
+        noise_lr: 0.0,
         opacity_regularizer: 0.0,
         scale_regularizer: 0.0,
         rates,

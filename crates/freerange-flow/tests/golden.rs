@@ -120,7 +120,7 @@ fn euler_with_both_guidances_on_the_toy_model() {
         assert_close(
             "last",
             &estimates[estimates.len() - rows..],
-            v.floats("out/zhat_guided")[estimates.len() - rows..],
+            &v.floats("out/zhat_guided")[estimates.len() - rows..],
             1e-4,
         );
     }
