@@ -53,7 +53,7 @@ pub struct Figures {
     pub psnr: f64,
     /// Samples that is the mean of.
     pub samples: usize,
-    /// Of the first samples: other views of the object above the same of the sample.
+    /// Of the first samples of this rank: other views of the object above the same of the sample.
     #[serde(skip)]
     pub pictures: Vec<RgbaImage>,
 }

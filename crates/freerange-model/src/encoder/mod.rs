@@ -22,6 +22,7 @@ use crate::{
 
 /// What a patch is turned into.
 #[derive(Module, Debug)]
+#[allow(clippy::large_enum_variant)] // there is one per model
 enum Appearance {
     /// Its pixels, or what a small network of the model's own makes of them.
     Patch(Option<PatchMlp>),
