@@ -50,10 +50,13 @@ export async function browser(width, height) {
     if (message.error) answer?.fail(new Error(message.error.message));
     else answer?.done(message.result);
   };
-  const send = (method, params = {}) => new Promise((done, fail) => {
+  const ask = (method, params, sessionId) => new Promise((done, fail) => {
     waiting.set(++last, { done, fail });
-    socket.send(JSON.stringify({ id: last, method, params, sessionId: session }));
+    socket.send(JSON.stringify({ id: last, method, params, sessionId }));
   });
+  const send = (method, params = {}) => ask(method, params, session);
+  // Seconds of all processors, of all processes of the browser.
+  const processorTime = async () => (await ask("SystemInfo.getProcessInfo", {})).processInfo.reduce((sum, p) => sum + p.cpuTime, 0);
   const { targetInfos } = await send("Target.getTargets");
   const page = targetInfos.find((t) => t.type === "page");
   ({ sessionId: session } = await send("Target.attachToTarget", { targetId: page.targetId, flatten: true }));
@@ -85,5 +88,5 @@ export async function browser(width, height) {
     chromium.kill();
     await Promise.race([ended, new Promise((done) => setTimeout(done, 3000))]);
   };
-  return { send, evaluate, until, open, close, errors };
+  return { send, processorTime, evaluate, until, open, close, errors };
 }

@@ -10,7 +10,7 @@ export default [
       sourceType: "script",
       globals: names("window document location fetch EventSource FormData File OffscreenCanvas HTMLElement "
         + "HTMLButtonElement HTMLInputElement HTMLSelectElement HTMLProgressElement HTMLCanvasElement HTMLFormElement HTMLAnchorElement HTMLDialogElement "
-        + "createImageBitmap setTimeout clearTimeout requestAnimationFrame cancelAnimationFrame ResizeObserver getComputedStyle URLSearchParams atob Viewer"),
+        + "createImageBitmap setTimeout clearTimeout requestAnimationFrame cancelAnimationFrame ResizeObserver getComputedStyle performance URLSearchParams atob Viewer BUDGET"),
     },
     rules: { eqeqeq: "error", "no-implicit-globals": "off", "no-var": "error", "prefer-const": "error", "no-eval": "error", "no-unused-vars": ["error", { varsIgnorePattern: "^Viewer$" }] },
   },

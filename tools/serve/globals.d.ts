@@ -1,6 +1,7 @@
 // What the page's two scripts share. The viewer's is a script of its own, shown here as the page sees it.
 interface Pinhole { width: number; height: number; fx: number; fy: number; cx: number; cy: number; world_to_camera: number[] }
 interface Orbit { target: number[]; azimuth: number; elevation: number; distance: number; fov: number }
+declare const BUDGET: number;
 declare class Viewer {
   constructor(canvas: HTMLCanvasElement, options: { up: number[]; background: number[] });
   canvas: HTMLCanvasElement;
@@ -13,6 +14,8 @@ declare class Viewer {
   frames: number;
   onmove: ((viewer: Viewer) => void) | null;
   ondraw: ((viewer: Viewer) => void) | null;
+  budget: number;
+  size(scale?: number): number[];
   setGaussians(rows: Float32Array): void;
   frameSphere(target: number[], radius: number): void;
   setCamera(camera: Pinhole): void;

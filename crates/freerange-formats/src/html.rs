@@ -4,10 +4,11 @@
 //! `up`.
 
 use base64::{Engine, engine::general_purpose::STANDARD};
+use freerange_core::Invalid;
 use freerange_splat::{Cloud, channel};
 use sha2::{Digest, Sha256};
 
-use crate::{Encoded, Frame, Loaded, error::Problem, quantize::Row};
+use crate::{Encoded, Frame, Loaded, error::problem, quantize::Row};
 
 const PAGE: &str = include_str!("viewer/page.html");
 const STYLE: &str = include_str!("viewer/style.css");
@@ -48,17 +49,17 @@ pub fn encode(cloud: &Cloud, frame: Frame) -> Encoded {
     Encoded { bytes: page.into_bytes(), notes: Vec::new() }
 }
 
-pub fn decode(bytes: &[u8]) -> Result<Loaded, Problem> {
-    let problem = |expected: &'static str, found: &dyn std::fmt::Display| Problem::new("Gaussians", expected, found);
-    let page = std::str::from_utf8(bytes).map_err(|e| Problem::new("page", "UTF-8", e))?;
+pub fn decode(bytes: &[u8]) -> Result<Loaded, Invalid> {
+    let wrong = |expected: &'static str, found: &dyn std::fmt::Display| problem("Gaussians", expected, found);
+    let page = std::str::from_utf8(bytes).map_err(|e| problem("page", "UTF-8", e))?;
     let data =
         page.split_once(BEFORE).and_then(|(_, rest)| rest.split_once("\">")).and_then(|(_, d)| d.split_once(AFTER));
     let Some((data, _)) = data else {
-        return Err(problem("a page that this program wrote", &"none of its data"));
+        return Err(wrong("a page that this program wrote", &"none of its data"));
     };
-    let data = STANDARD.decode(data.trim()).map_err(|e| problem("base64", &e))?;
+    let data = STANDARD.decode(data.trim()).map_err(|e| wrong("base64", &e))?;
     if !data.len().is_multiple_of(size_of::<Row>()) {
-        return Err(problem("a multiple of 56 bytes", &data.len()));
+        return Err(wrong("a multiple of 56 bytes", &data.len()));
     }
     let values = data.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect::<Vec<_>>();
     debug_assert!(values.len().is_multiple_of(channel::COUNT));

@@ -1,60 +1,60 @@
 "use strict";
-// Shows 3D Gaussians with WebGL 2. Each is projected as the rasteriser of this program does it: the linearised projection of its covariance plus a
-// blur of 0.3 square pixels, opacity at most 0.99 and nothing below 1/255, blended by camera z. Colours are as in image files (sRGB-encoded).
+// Shows 3D Gaussians, with WebGL 2 where there is a graphics card, else with loops of our own. Each is projected as the rasteriser of this program does
+// it: the linearised projection of its covariance plus a blur of 0.3 square pixels, opacity at most 0.99 and nothing below 1/255, blended by camera z.
+// Colours are as in image files (sRGB-encoded).
 
 const CHANNELS = 14; // mean 3, log-scale 3, rotation wxyz 4, logit of opacity, colour 3
 const TEXTURE_ROW = 1024; // Gaussians per row of the texture, four texels each
+const BLUR = 0.3; // square pixels
+const BUDGET = 1000 / 30; // milliseconds for a picture of many in motion
+const REST = 150; // milliseconds without motion after which a picture may take its time
 
+// Four vertices per Gaussian, which may not be instances: processors that play graphics cards draw each instance for itself.
 const VERTEX = `#version 300 es
 precision highp float;
 precision highp int;
 uniform highp sampler2D gaussians;
+uniform highp usampler2D order;
 uniform mat4 camera; // world to camera: x right, y down, z forward
 uniform vec2 size, focal, middle;
 uniform float near;
-in uint index;
 flat out vec4 color; // and opacity
-flat out vec3 conic; // inverse covariance: xx, xy, yy
-flat out vec2 center; // pixels, y down
-vec4 texel(int k) {
-  return texelFetch(gaussians, ivec2(int(index % ${TEXTURE_ROW}u) * 4 + k, int(index / ${TEXTURE_ROW}u)), 0);
-}
+out vec2 local; // in standard deviations, along the ellipse's axes
 void main() {
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0); // outside, unless it is drawn
-  vec4 a = texel(0), b = texel(1), c = texel(2), d = texel(3);
+  int place = gl_VertexID >> 2;
+  int index = int(texelFetch(order, ivec2(place % ${TEXTURE_ROW}, place / ${TEXTURE_ROW}), 0).x);
+  ivec2 first = ivec2(index % ${TEXTURE_ROW} * 4, index / ${TEXTURE_ROW});
+  vec4 a = texelFetch(gaussians, first, 0);
   vec3 p = (camera * vec4(a.xyz, 1.0)).xyz;
   if (!(p.z >= near) || a.w < 1.0 / 255.0) return;
+  vec4 b = texelFetch(gaussians, first + ivec2(1, 0), 0), c = texelFetch(gaussians, first + ivec2(2, 0), 0), d = texelFetch(gaussians, first + ivec2(3, 0), 0);
   mat3 shape = mat3(b.xyz, vec3(b.w, c.xy), vec3(c.zw, d.x)); // rotation times standard deviations
   vec2 low = -(middle + 0.15 * size) / focal, high = (1.15 * size - middle) / focal;
   vec2 slope = clamp(p.xy / p.z, low, high);
   mat3 w = transpose(mat3(camera)); // its columns are the camera's axes
   vec3 u = (focal.x / p.z) * (w[0] - slope.x * w[2]) * shape;
   vec3 v = (focal.y / p.z) * (w[1] - slope.y * w[2]) * shape;
-  const float BLUR = 0.3;
   float xx = dot(u, u), xy = dot(u, v), yy = dot(v, v);
   vec3 minors = cross(u, v); // the determinant as a sum of squares: differences would cancel for needles
-  float det = dot(minors, minors) + BLUR * (xx + yy + BLUR);
-  xx += BLUR;
-  yy += BLUR;
-  conic = vec3(yy, -xy, xx) / det;
-  center = focal * p.xy / p.z + middle;
+  float det = dot(minors, minors) + ${BLUR} * (xx + yy + ${BLUR});
+  // The ellipse's axes: a box along them is the smallest.
+  float lean = 0.5 * (xx - yy), apart = length(vec2(lean, xy)), most = 0.5 * (xx + yy) + ${BLUR} + apart;
+  vec2 along = apart == 0.0 ? vec2(1.0, 0.0) : normalize(lean > 0.0 ? vec2(lean + apart, xy) : vec2(xy, apart - lean));
+  vec2 deviations = sqrt(vec2(most, det / most));
+  local = (vec2(gl_VertexID & 1, gl_VertexID >> 1 & 1) * 2.0 - 1.0) * (sqrt(2.0 * log(255.0 * a.w)) + 0.5 / deviations); // where the opacity falls to 1/255
   color = vec4(d.yzw, a.w);
-  vec2 reach = sqrt(2.0 * log(255.0 * a.w) * vec2(xx, yy)) + 0.5; // where the opacity falls to 1/255
-  vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
-  vec2 at = (center + corner * reach) / size * 2.0 - 1.0;
+  vec2 at = (focal * p.xy / p.z + middle + mat2(along, -along.y, along.x) * (local * deviations)) / size * 2.0 - 1.0;
   gl_Position = vec4(at.x, -at.y, 0.0, 1.0);
 }`;
 
 const FRAGMENT = `#version 300 es
 precision highp float;
-uniform vec2 size;
 flat in vec4 color;
-flat in vec3 conic;
-flat in vec2 center;
+in vec2 local;
 out vec4 result;
 void main() {
-  vec2 d = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y) - center;
-  float alpha = min(0.99, color.a * exp(-0.5 * (conic.x * d.x * d.x + 2.0 * conic.y * d.x * d.y + conic.z * d.y * d.y)));
+  float alpha = min(0.99, color.a * exp(-0.5 * dot(local, local)));
   if (alpha < 1.0 / 255.0) discard;
   result = vec4(color.rgb * alpha, alpha);
 }`;
@@ -76,52 +76,39 @@ const add = (a, b, s = 1) => a.map((x, i) => x + s * b[i]);
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const unit = (a) => a.map((x) => x / Math.hypot(...a));
+const resize = (canvas, [width, height]) => { if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height }); };
 
-class Viewer {
-  // `up` is the direction that stays up; colours are an array of three in 0..1.
-  constructor(canvas, { up = [0, 0, 1], background = [1, 1, 1] } = {}) {
-    this.canvas = canvas;
-    this.background = background;
-    this.frames = this.count = 0;
-    this.rows = this.depth = new Float32Array(0);
-    this.sorted = [new Uint32Array(0), new Uint32Array(0)];
-    this.up = unit(up);
-    // Azimuth 0 looks along the first axis that is not up.
-    const side = Math.abs(this.up[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0];
-    this.front = unit(add(side, this.up, -dot(side, this.up)));
-    this.home = { target: [0, 0, 0], azimuth: 0, elevation: 20 * Math.PI / 180, distance: 1.6, fov: 45 };
-    this.orbit = { ...this.home };
-    this.near = 0.01;
-    this.camera = null;
-    this.onmove = this.ondraw = null;
-    this.setUp();
-    canvas.addEventListener("webglcontextlost", (e) => e.preventDefault());
-    canvas.addEventListener("webglcontextrestored", () => { this.setUp(); this.setGaussians(this.rows); });
-    new ResizeObserver(() => this.redraw()).observe(canvas);
-    this.listen();
-  }
+// What draws: `setGaussians` takes four texels of four numbers each per Gaussian (mean and opacity, rotation times deviations by columns, colour); `begin`
+// starts a picture, `step` draws some of it and is true when it is done; `cost` is how many milliseconds the last one took, once it is not `busy`.
 
-  setUp() {
-    const gl = this.canvas.getContext("webgl2", { antialias: false, alpha: false });
-    if (!gl) throw new Error("This page needs WebGL 2, which this browser does not offer here.");
+// With WebGL 2.
+class Card {
+  constructor(gl) {
     this.gl = gl;
+    this.cost = 0;
+    this.fence = null;
     // Sums of many faint Gaussians lose too much in 8 bits; where there are no more, they have to do.
     this.half = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
     this.draws = this.program(VERTEX, FRAGMENT);
     this.copies = this.program(COPY_VERTEX, COPY_FRAGMENT);
-    this.texture = gl.createTexture();
-    this.sum = gl.createTexture();
+    this.texture = this.plain();
+    this.order = this.plain();
+    this.sum = this.plain();
     this.target = gl.createFramebuffer();
     this.sumSize = [0, 0];
-    this.order = gl.createBuffer();
-    this.instances = gl.createVertexArray();
+    this.quads = gl.createVertexArray();
     this.nothing = gl.createVertexArray();
-    gl.bindVertexArray(this.instances);
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
-    const index = gl.getAttribLocation(this.draws, "index");
-    gl.enableVertexAttribArray(index);
-    gl.vertexAttribIPointer(index, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.vertexAttribDivisor(index, 1);
+    gl.bindVertexArray(this.quads);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    this.room = this.count = 0;
+  }
+
+  // A texture of numbers, not to be smoothed.
+  plain() {
+    const gl = this.gl, texture = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
+    return texture;
   }
 
   program(vertex, fragment) {
@@ -137,9 +124,275 @@ class Viewer {
     return program;
   }
 
+  setGaussians(texels, count) {
+    const gl = this.gl, height = texels.length / TEXTURE_ROW / 16;
+    this.count = count;
+    gl.bindTexture(gl.TEXTURE_2D, this.texture);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, TEXTURE_ROW * 4, height, 0, gl.RGBA, gl.FLOAT, texels);
+    if (this.room >= count) return;
+    this.room = height * TEXTURE_ROW;
+    const corners = new Uint32Array(6 * this.room);
+    for (let i = 0; i < this.room; i++) corners.set([4 * i, 4 * i + 1, 4 * i + 2, 4 * i + 2, 4 * i + 1, 4 * i + 3], 6 * i);
+    gl.bindVertexArray(this.quads);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
+  }
+
+  begin({ size, axes, eye, focal, middle, near, background }, sorted, changed) {
+    const gl = this.gl;
+    this.started = performance.now();
+    resize(gl.canvas, size);
+    gl.viewport(0, 0, ...size);
+    if (this.half) this.bindSum(size);
+    if (this.half) gl.clearColor(0, 0, 0, 0);
+    else gl.clearColor(...background, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    gl.useProgram(this.draws);
+    const at = (name) => gl.getUniformLocation(this.draws, name);
+    gl.uniformMatrix4fv(at("camera"), false, [0, 1, 2].flatMap((k) => [...axes.map((a) => a[k]), 0])
+      .concat(axes.map((a) => -dot(a, eye)), 1));
+    gl.uniform2f(at("size"), ...size);
+    gl.uniform2f(at("focal"), ...focal);
+    gl.uniform2f(at("middle"), ...middle);
+    gl.uniform1f(at("near"), near);
+    gl.uniform1i(at("order"), 1);
+    gl.activeTexture(gl.TEXTURE1);
+    gl.bindTexture(gl.TEXTURE_2D, this.order);
+    if (changed) gl.texImage2D(gl.TEXTURE_2D, 0, gl.R32UI, TEXTURE_ROW, sorted.length / TEXTURE_ROW, 0, gl.RED_INTEGER, gl.UNSIGNED_INT, sorted);
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, this.texture);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.bindVertexArray(this.quads);
+    gl.drawElements(gl.TRIANGLES, 6 * this.count, gl.UNSIGNED_INT, 0);
+    gl.disable(gl.BLEND);
+    if (this.half) {
+      gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+      gl.useProgram(this.copies);
+      gl.uniform3f(gl.getUniformLocation(this.copies, "back"), ...background);
+      gl.bindTexture(gl.TEXTURE_2D, this.sum);
+      gl.bindVertexArray(this.nothing);
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+    }
+    if (this.fence) gl.deleteSync(this.fence);
+    this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+  }
+
+  step() {
+    return true;
+  }
+
+  busy() {
+    const gl = this.gl;
+    if (!this.fence || gl.isContextLost()) return false;
+    if (gl.getSyncParameter(this.fence, gl.SYNC_STATUS) !== gl.SIGNALED) return true;
+    this.cost = performance.now() - this.started;
+    gl.deleteSync(this.fence);
+    this.fence = null;
+    return false;
+  }
+
+  // Waits for the picture, for measurements.
+  finish() {
+    this.gl.readPixels(0, 0, 1, 1, this.gl.RGBA, this.gl.UNSIGNED_BYTE, new Uint8Array(4));
+  }
+
+  bindSum(size) {
+    const gl = this.gl;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
+    if (this.sumSize[0] === size[0] && this.sumSize[1] === size[1]) return;
+    this.sumSize = size;
+    gl.bindTexture(gl.TEXTURE_2D, this.sum);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA16F, ...size, 0, gl.RGBA, gl.HALF_FLOAT, null);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.sum, 0);
+  }
+}
+
+// exp() between -12 and 12, several times as quick as Math.exp(), to ten digits.
+const EXP = Float64Array.from({ length: 24 * 64 + 1 }, (_, i) => Math.exp(i / 64 - 12));
+const exp = (x) => {
+  const i = Math.round(64 * x), r = x - i / 64;
+  return EXP[i + 768] * (1 + r * (1 + r * (0.5 + r * (1 / 6))));
+};
+
+const SHAPE = 14; // first and last row, centre 2, inverse covariance 3 (xx, xy, yy), inverse determinant, opacity, limit of the exponent, colour 3, free
+
+// Blends shapes, from far to near, into the rows from `top` to before `bottom`; `sum` holds these rows alone. Along a row a Gaussian is a product: from
+// pixel to pixel it changes by a factor, which changes by a constant factor.
+const blend = (shapes, count, sum, width, top, bottom) => {
+  for (let o = 0; o < count * SHAPE; o += SHAPE) {
+    const first = Math.max(top, shapes[o]), last = Math.min(bottom - 1, shapes[o + 1]);
+    if (first > last) continue;
+    const cx = shapes[o + 2], cy = shapes[o + 3], xx = shapes[o + 4], xy = shapes[o + 5], yy = shapes[o + 6], det = shapes[o + 7];
+    const opacity = shapes[o + 8], limit = shapes[o + 9], red = shapes[o + 10], green = shapes[o + 11], blue = shapes[o + 12], bend = exp(-xx), part = 1 / xx;
+    for (let y = first; y <= last; y++) {
+      const dy = y + 0.5 - cy, inside = xx * limit - det * dy * dy;
+      if (!(inside > 0)) continue;
+      const half = Math.sqrt(inside) * part, middle = cx - 0.5 - xy * dy * part;
+      const from = Math.max(0, Math.ceil(middle - half)), to = Math.min(width - 1, Math.floor(middle + half));
+      if (from > to) continue;
+      const dx = from + 0.5 - cx;
+      let value = opacity * exp(-0.5 * (xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy)), factor = exp(-xx * (dx + 0.5) - xy * dy);
+      for (let j = 3 * ((y - top) * width + from), end = j + 3 * (to - from); j <= end; j += 3) {
+        const alpha = value < 0.99 ? value : 0.99, r = sum[j], g = sum[j + 1], b = sum[j + 2];
+        sum[j] = r + alpha * (red - r);
+        sum[j + 1] = g + alpha * (green - g);
+        sum[j + 2] = b + alpha * (blue - b);
+        value *= factor;
+        factor *= bend;
+      }
+    }
+  }
+};
+
+// With the processor alone: where a browser has no graphics card it plays one, on which this many blended layers take many times as long.
+class Processor {
+  constructor(context) {
+    this.context = context;
+    this.cost = this.visible = 0;
+    this.picture = null;
+    this.sum = this.shapes = new Float64Array(0);
+  }
+
+  setGaussians(texels, count) {
+    this.texels = texels;
+    this.count = count;
+    this.shapes = new Float64Array(SHAPE * count);
+  }
+
+  begin(view, sorted) {
+    this.started = performance.now();
+    this.view = view;
+    this.project(view, sorted);
+    const [width, height] = view.size;
+    if (this.picture?.width !== width || this.picture.height !== height) this.picture = this.context.createImageData(width, height);
+    // Rows whose sums stay in a processor's cache; and a picture of many rows does not need much memory.
+    this.band = Math.max(1, Math.min(height, Math.floor(40_000 / width)));
+    if (this.sum.length < 3 * width * this.band) this.sum = new Float64Array(3 * width * this.band);
+    this.top = 0;
+    this.cost = performance.now() - this.started;
+  }
+
+  // As in the vertex shader.
+  project({ size: [width, height], axes: [right, down, forward], eye, focal, middle, near }, sorted) {
+    const t = this.texels, shapes = this.shapes;
+    const lowX = -(middle[0] + 0.15 * width) / focal[0], highX = (1.15 * width - middle[0]) / focal[0];
+    const lowY = -(middle[1] + 0.15 * height) / focal[1], highY = (1.15 * height - middle[1]) / focal[1];
+    const [rx, ry, rz] = right, [vx, vy, vz] = down, [fx, fy, fz] = forward;
+    let o = 0;
+    for (let k = 0; k < this.count; k++) {
+      const i = 16 * sorted[k], opacity = t[i + 3], x = t[i] - eye[0], y = t[i + 1] - eye[1], z = t[i + 2] - eye[2];
+      const depth = fx * x + fy * y + fz * z;
+      if (!(depth >= near) || opacity < 1 / 255) continue;
+      const sx = (rx * x + ry * y + rz * z) / depth, sy = (vx * x + vy * y + vz * z) / depth, a = focal[0] / depth, b = focal[1] / depth;
+      const mx = Math.max(lowX, Math.min(highX, sx)), my = Math.max(lowY, Math.min(highY, sy));
+      const ax = a * (rx - mx * fx), ay = a * (ry - mx * fy), az = a * (rz - mx * fz), bx = b * (vx - my * fx), by = b * (vy - my * fy), bz = b * (vz - my * fz);
+      const u0 = ax * t[i + 4] + ay * t[i + 5] + az * t[i + 6], u1 = ax * t[i + 7] + ay * t[i + 8] + az * t[i + 9], u2 = ax * t[i + 10] + ay * t[i + 11] + az * t[i + 12];
+      const v0 = bx * t[i + 4] + by * t[i + 5] + bz * t[i + 6], v1 = bx * t[i + 7] + by * t[i + 8] + bz * t[i + 9], v2 = bx * t[i + 10] + by * t[i + 11] + bz * t[i + 12];
+      const xx = u0 * u0 + u1 * u1 + u2 * u2, xy = u0 * v0 + u1 * v1 + u2 * v2, yy = v0 * v0 + v1 * v1 + v2 * v2;
+      const m0 = u1 * v2 - u2 * v1, m1 = u2 * v0 - u0 * v2, m2 = u0 * v1 - u1 * v0;
+      const det = m0 * m0 + m1 * m1 + m2 * m2 + BLUR * (xx + yy + BLUR), limit = 2 * Math.log(255 * opacity);
+      const cx = focal[0] * sx + middle[0], cy = focal[1] * sy + middle[1], wide = Math.sqrt(limit * (xx + BLUR)), high = Math.sqrt(limit * (yy + BLUR));
+      if (!(cx + wide > 0 && cx - wide < width && cy + high > 0 && cy - high < height && det < Infinity)) continue;
+      shapes[o] = Math.max(0, Math.ceil(cy - high - 0.5));
+      shapes[o + 1] = Math.min(height - 1, Math.floor(cy + high - 0.5));
+      shapes[o + 2] = cx;
+      shapes[o + 3] = cy;
+      shapes[o + 4] = (yy + BLUR) / det;
+      shapes[o + 5] = -xy / det;
+      shapes[o + 6] = (xx + BLUR) / det;
+      shapes[o + 7] = 1 / det;
+      shapes[o + 8] = opacity;
+      shapes[o + 9] = limit;
+      shapes[o + 10] = t[i + 13];
+      shapes[o + 11] = t[i + 14];
+      shapes[o + 12] = t[i + 15];
+      o += SHAPE;
+    }
+    this.visible = o / SHAPE;
+  }
+
+  step() {
+    const began = performance.now(), { size: [width, height], background: [red, green, blue] } = this.view, { sum, top } = this;
+    const bottom = Math.min(height, top + this.band), bytes = this.picture.data, length = 3 * width * (bottom - top);
+    for (let j = 0; j < length; j += 3) {
+      sum[j] = red;
+      sum[j + 1] = green;
+      sum[j + 2] = blue;
+    }
+    blend(this.shapes, this.visible, sum, width, top, bottom);
+    for (let j = 0, k = 4 * width * top; j < length; j += 3, k += 4) {
+      bytes[k] = 255 * sum[j];
+      bytes[k + 1] = 255 * sum[j + 1];
+      bytes[k + 2] = 255 * sum[j + 2];
+      bytes[k + 3] = 255;
+    }
+    this.top = bottom;
+    const done = bottom === height;
+    if (done) {
+      resize(this.context.canvas, this.view.size);
+      this.context.putImageData(this.picture, 0, 0);
+    }
+    this.cost += performance.now() - began;
+    return done;
+  }
+
+  busy() {
+    return false;
+  }
+
+  finish() {}
+}
+
+// Whether there is a graphics card, and not a processor that plays one. Asked of a canvas of its own: one that has drawn by a card cannot do without again.
+const hasCard = () => {
+  const gl = document.createElement("canvas").getContext("webgl2", { failIfMajorPerformanceCaveat: true });
+  if (!gl) return false;
+  const name = gl.getParameter(gl.getExtension("WEBGL_debug_renderer_info")?.UNMASKED_RENDERER_WEBGL ?? gl.RENDERER);
+  gl.getExtension("WEBGL_lose_context")?.loseContext();
+  return !/swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
+};
+
+class Viewer {
+  // `up` is the direction that stays up; colours are an array of three in 0..1. `by`, "card" or "processor", is what draws if that is not to be chosen here.
+  constructor(canvas, { up = [0, 0, 1], background = [1, 1, 1], by = "" } = {}) {
+    this.canvas = canvas;
+    this.background = background;
+    this.frames = this.count = 0;
+    this.rows = this.depth = new Float32Array(0);
+    this.sorted = [new Uint32Array(0), new Uint32Array(0)];
+    this.seen = ""; // from where they were sorted
+    // Pictures in motion have less resolution where full ones take too long: by the fourth root of 1/2 per step.
+    this.coarser = this.quick = 0;
+    this.budget = BUDGET;
+    this.changed = -Infinity; // when something moved last
+    this.watching = false;
+    this.up = unit(up);
+    // Azimuth 0 looks along the first axis that is not up.
+    const side = Math.abs(this.up[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0];
+    this.front = unit(add(side, this.up, -dot(side, this.up)));
+    this.home = { target: [0, 0, 0], azimuth: 0, elevation: 20 * Math.PI / 180, distance: 1.6, fov: 45 };
+    this.orbit = { ...this.home };
+    this.near = 0.01;
+    this.camera = null;
+    this.onmove = this.ondraw = null;
+    const card = by ? by === "card" : hasCard();
+    const gl = card ? canvas.getContext("webgl2", { antialias: false, alpha: false }) : null, context = gl ? null : canvas.getContext("2d", { alpha: false });
+    if (!gl && !context) throw new Error("This browser does not offer a canvas to draw on.");
+    this.painter = gl ? new Card(gl) : new Processor(context);
+    this.setGaussians(this.rows);
+    canvas.addEventListener("webglcontextlost", (e) => e.preventDefault());
+    canvas.addEventListener("webglcontextrestored", () => {
+      this.painter = new Card(gl);
+      this.setGaussians(this.rows);
+    });
+    new ResizeObserver(() => this.redraw()).observe(canvas);
+    this.listen();
+  }
+
   // Rows of 14 channels. Shows them from where the last ones were shown.
   setGaussians(rows) {
-    const gl = this.gl, n = Math.floor(rows.length / CHANNELS), height = Math.max(1, Math.ceil(n / TEXTURE_ROW));
+    const n = Math.floor(rows.length / CHANNELS), height = Math.max(1, Math.ceil(n / TEXTURE_ROW));
     const texels = new Float32Array(height * TEXTURE_ROW * 16);
     for (let i = 0; i < n; i++) {
       const r = rows.subarray(i * CHANNELS, (i + 1) * CHANNELS), norm = Math.hypot(r[6], r[7], r[8], r[9]) || 1;
@@ -156,12 +409,10 @@ class Viewer {
     this.rows = rows;
     this.count = n;
     this.depth = new Float32Array(n);
-    this.sorted = [new Uint32Array(n), new Uint32Array(n)];
-    gl.bindTexture(gl.TEXTURE_2D, this.texture);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, TEXTURE_ROW * 4, height, 0, gl.RGBA, gl.FLOAT, texels);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
-    this.redraw();
+    this.sorted = [0, 1].map(() => new Uint32Array(height * TEXTURE_ROW));
+    this.seen = "";
+    this.painter.setGaussians(texels, n);
+    this.stir();
   }
 
   // Looks at everything but stragglers.
@@ -233,75 +484,99 @@ class Viewer {
     return { focal: [focal, focal], middle: size.map((v) => v / 2) };
   }
 
+  // What was shown is not right any more.
   redraw() {
-    this.pending ??= requestAnimationFrame(() => this.draw());
+    this.pending ??= requestAnimationFrame(() => this.frame());
   }
 
+  // And more of it is to be expected soon.
+  stir() {
+    this.changed = performance.now();
+    this.redraw();
+  }
+
+  frame() {
+    this.pending = undefined;
+    if (this.watching) {
+      this.redraw();
+    } else if (performance.now() - this.changed < REST) {
+      this.paint(2 ** (-this.coarser / 4));
+      this.watching = true;
+      this.govern();
+      clearTimeout(this.resting);
+      if (this.coarser) this.resting = setTimeout(() => this.redraw(), REST);
+    } else {
+      this.coarser = Math.max(0, this.coarser - 1); // perhaps it was slow by chance
+      this.start(1);
+      this.goOn();
+    }
+  }
+
+  // The whole picture in full resolution, at once.
   draw() {
     cancelAnimationFrame(this.pending);
     this.pending = undefined;
-    const gl = this.gl, ratio = window.devicePixelRatio || 1;
-    const size = [this.canvas.clientWidth, this.canvas.clientHeight].map((v) => Math.max(1, Math.round(v * ratio)));
-    if (gl.isContextLost()) return;
-    if (this.canvas.width !== size[0]) this.canvas.width = size[0];
-    if (this.canvas.height !== size[1]) this.canvas.height = size[1];
-    const { right, down, forward, eye } = this.pose(), axes = [right, down, forward];
-    const { focal, middle } = this.lens(size);
-    this.sort(forward, eye);
+    this.paint(1);
+  }
 
-    gl.viewport(0, 0, ...size);
-    if (this.half) this.bindSum(size);
-    const back = this.background;
-    if (this.half) gl.clearColor(0, 0, 0, 0);
-    else gl.clearColor(...back, 1);
-    gl.clear(gl.COLOR_BUFFER_BIT);
-    gl.useProgram(this.draws);
-    const at = (name) => gl.getUniformLocation(this.draws, name);
-    gl.uniformMatrix4fv(at("camera"), false, [0, 1, 2].flatMap((k) => [...axes.map((a) => a[k]), 0])
-      .concat(axes.map((a) => -dot(a, eye)), 1));
-    gl.uniform2f(at("size"), ...size);
-    gl.uniform2f(at("focal"), ...focal);
-    gl.uniform2f(at("middle"), ...middle);
-    gl.uniform1f(at("near"), this.near);
-    gl.bindTexture(gl.TEXTURE_2D, this.texture);
-    gl.enable(gl.BLEND);
-    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    gl.bindVertexArray(this.instances);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
-    gl.disable(gl.BLEND);
-    if (this.half) {
-      gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-      gl.useProgram(this.copies);
-      gl.uniform3f(gl.getUniformLocation(this.copies, "back"), ...back);
-      gl.bindTexture(gl.TEXTURE_2D, this.sum);
-      gl.bindVertexArray(this.nothing);
-      gl.drawArrays(gl.TRIANGLES, 0, 3);
+  paint(scale) {
+    this.start(scale);
+    while (!this.painter.step());
+    this.shown();
+  }
+
+  // A picture at rest lets other work come between its parts.
+  goOn() {
+    if (this.painter.step()) this.shown();
+    else this.resting = setTimeout(() => this.goOn());
+  }
+
+  // Of pictures in motion: as much resolution as there is time for.
+  govern() {
+    if (this.painter.busy()) {
+      setTimeout(() => this.govern(), 1);
+      return;
     }
+    this.watching = false;
+    const { cost } = this.painter;
+    this.quick = cost < 0.6 * this.budget ? this.quick + 1 : 0;
+    if (cost > this.budget) {
+      this.coarser = Math.min(6, this.coarser + Math.min(4, Math.ceil(2 * Math.log2(cost / this.budget))));
+    } else if (this.quick > 3) {
+      this.coarser = Math.max(0, this.coarser - 1);
+      this.quick = 0;
+    }
+  }
+
+  // The picture's size in pixels.
+  size(scale = 1) {
+    const ratio = scale * (window.devicePixelRatio || 1);
+    return [this.canvas.clientWidth, this.canvas.clientHeight].map((v) => Math.max(1, Math.round(v * ratio)));
+  }
+
+  start(scale) {
+    clearTimeout(this.resting);
+    const size = this.size(scale), { right, down, forward, eye } = this.pose();
+    const changed = this.sort(forward, eye), view = { size, axes: [right, down, forward], eye, near: this.near, background: this.background, ...this.lens(size) };
+    this.painter.begin(view, this.sorted[1], changed);
+  }
+
+  shown() {
     this.frames += 1;
     this.canvas.dataset.frames = this.frames;
     this.ondraw?.(this);
   }
 
-  bindSum(size) {
-    const gl = this.gl;
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
-    if (this.sumSize[0] === size[0] && this.sumSize[1] === size[1]) return;
-    this.sumSize = size;
-    gl.bindTexture(gl.TEXTURE_2D, this.sum);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA16F, ...size, 0, gl.RGBA, gl.HALF_FLOAT, null);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.sum, 0);
-  }
-
   // From far to near; of equals the last first. Bits of positive floats are ordered as they are: three passes of 11 bits.
+  // False if they are sorted already.
   sort(forward, eye) {
-    const n = this.count;
-    if (n === 0) return;
-    const bits = new Uint32Array(this.depth.buffer), offset = dot(forward, eye);
+    const n = this.count, { rows, depth } = this, from = String([forward, eye]);
+    if (this.seen === from) return false;
+    this.seen = from;
+    const bits = new Uint32Array(depth.buffer), offset = dot(forward, eye);
     for (let i = 0; i < n; i++) {
-      const z = forward[0] * this.rows[i * CHANNELS] + forward[1] * this.rows[i * CHANNELS + 1] + forward[2] * this.rows[i * CHANNELS + 2];
-      this.depth[i] = Math.max(0, z - offset);
+      const z = forward[0] * rows[i * CHANNELS] + forward[1] * rows[i * CHANNELS + 1] + forward[2] * rows[i * CHANNELS + 2];
+      depth[i] = Math.max(0, z - offset);
       this.sorted[0][i] = n - 1 - i;
     }
     for (let pass = 0; pass < 3; pass++) {
@@ -311,8 +586,7 @@ class Viewer {
       for (let k = 1; k < 2049; k++) start[k] += start[k - 1];
       for (let i = n - 1; i >= 0; i--) to[--start[2048 - (bits[from[i]] >>> shift & 2047)]] = from[i];
     }
-    this.gl.bindBuffer(this.gl.ARRAY_BUFFER, this.order);
-    this.gl.bufferData(this.gl.ARRAY_BUFFER, this.sorted[1], this.gl.DYNAMIC_DRAW);
+    return true;
   }
 
   turn(azimuth, elevation) {
@@ -345,7 +619,7 @@ class Viewer {
 
   // Whoever looked elsewhere was a person: `onmove` hears of it.
   moved() {
-    this.redraw();
+    this.stir();
     this.onmove?.(this);
   }
 

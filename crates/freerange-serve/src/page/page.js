@@ -128,6 +128,8 @@
       panes.push(pane);
       if (panes.length > 1) Object.assign(viewer, { orbit: { ...panes[0].viewer.orbit }, camera: panes[0].viewer.camera });
     }
+    // They share the time of one picture.
+    for (const { viewer } of panes) viewer.budget = BUDGET / panes.length;
     repaint();
     window.viewers = panes.map((p) => p.viewer);
   };
@@ -150,7 +152,7 @@
   const sketch = (pane) => {
     const { over, viewer } = pane, understood = job?.understood, context = over.getContext("2d");
     if (!context) return;
-    const { width, height } = viewer.canvas;
+    const [width, height] = viewer.size();
     if (over.width !== width || over.height !== height) Object.assign(over, { width, height });
     context.clearRect(0, 0, width, height);
     if (!understood || !camerasShown || viewer.camera) return;
@@ -389,7 +391,7 @@
     const busy = ["queued", "running"].includes(now.state);
     if (understood) {
       showPanes(Math.max(1, busy ? now.options.samples ?? 1 : now.samples.length), understood);
-      panes.forEach((pane, i) => { if (!pane.caption.textContent) caption(pane, i, pane.viewer.count ?? 0); });
+      panes.forEach((pane, i) => { if (!pane.caption.textContent && pane.viewer.count) caption(pane, i, pane.viewer.count); });
       photos(now, understood);
       box("warnings").replaceChildren(...understood.warnings.map((text) => make("li", {}, text)));
       const passed = now.passed_over.length ? [`of no use here: ${now.passed_over.join(", ")}`] : [];
