@@ -175,3 +175,34 @@ train(long, run, 2)
 say(f"{kills} kills of a random rank, slowest end", f"{slowest:.2f} s")
 assert weights(run) == weights(whole), "other weights"
 say("weights of the killed run and of one never killed", "the same to the bit")
+
+# One rank is asked to end: all save after the same step, and the job goes on to the same weights.
+run = place / "asked"
+job = subprocess.Popen(command(long, run, 2), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=environment)
+until = time.monotonic() + 120
+while saved(run) == 0:
+    assert job.poll() is None and time.monotonic() < until, "it makes no progress"
+    time.sleep(0.002)
+os.kill(random.choice(ranks_of(run)), signal.SIGTERM)
+text = job.communicate(timeout=60)[0].decode()
+assert job.returncode == 0 and text.count("asked to end") == 1, (job.returncode, text)
+assert f"{saved(run)} of " in text, (saved(run), text)
+train(long, run, 2)
+assert weights(run) == weights(whole), "other weights"
+say("weights of the run of which one rank was asked to end", "the same to the bit")
+
+# Launchers ask the others to end when one has died, and wait: a rank that waits for the dead one must not.
+run = place / "alone-and-asked"
+job = subprocess.Popen(command(long, run, 2), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=environment)
+while saved(run) == 0:
+    assert job.poll() is None, "it makes no progress"
+    time.sleep(0.002)
+first, second = ranks_of(run)
+os.kill(second, signal.SIGTERM)
+os.kill(first, signal.SIGKILL)
+begin = time.monotonic()
+job.communicate(timeout=60)
+while lives(second):
+    assert time.monotonic() < begin + 10, "a rank waits for a dead one"
+    time.sleep(0.01)
+say("one rank killed and the other asked, both ended after", f"{time.monotonic() - begin:.2f} s")

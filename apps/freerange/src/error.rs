@@ -38,6 +38,11 @@ impl CliError {
         Self { source: text.into(), code, agreed: true }
     }
 
+    /// What was asked to end did so in order; the text says what there is now.
+    pub fn asked_to_end(text: &str) -> Self {
+        Self { source: format!("asked to end: {text}").into(), code: crate::signals::EXIT_CODE, agreed: false }
+    }
+
     /// Whether all ranks end with it.
     pub fn is_agreed(&self) -> bool {
         self.agreed
@@ -112,7 +117,7 @@ impl From<FlowError> for CliError {
     fn from(e: FlowError) -> Self {
         match e {
             FlowError::Data(e) => e.into(),
-            FlowError::Build(e) => e.into(),
+            FlowError::Fit(e) => e.into(),
             FlowError::NotFinite { .. }
             | FlowError::NoGradient
             | FlowError::Cancelled
@@ -228,8 +233,8 @@ mod tests {
         let found = CliError::from(data(io::ErrorKind::NotFound)).to_string();
         assert_eq!(found, format!("shards/a.tar: {}", io::Error::from(io::ErrorKind::NotFound)));
         // An error that does not say why.
-        let source = io::Error::from(io::ErrorKind::NotFound);
-        let error = freerange_camera::CameraError::Read { file: "a.json".into(), source };
+        let source = serde_json::from_str::<()>("{").unwrap_err();
+        let error = freerange_camera::CameraError::Json { file: "a.json".into(), source };
         assert_eq!(CliError::from(error).to_string().matches("because: ").count(), 1);
     }
 }

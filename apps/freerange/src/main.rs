@@ -7,6 +7,7 @@ mod photos;
 mod progress;
 mod ranks;
 mod runtime;
+mod signals;
 
 use std::process::ExitCode;
 

@@ -3,8 +3,17 @@
 use std::{borrow::Cow, path::Path};
 
 use freerange::machine::cache_folder;
+use freerange_build::{BuildConfig, MakingConfig};
 
 use crate::{error::CliError, progress::Progress};
+
+/// A configuration file: training, and how `freerange-build` makes objects for it.
+pub type TrainConfig = freerange_flow::config::TrainConfig<MakingConfig>;
+
+/// How shards for a training are made.
+pub fn build_config(config: &TrainConfig) -> BuildConfig {
+    config.data.making.build_config(config.seed, &config.depths())
+}
 
 /// The commit that this program was built from; `-dirty` if files had been changed.
 pub fn commit() -> String {

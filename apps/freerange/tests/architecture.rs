@@ -9,7 +9,7 @@ const ROOMS: &[(&str, &[&str])] = &[
     ("freerange-vectors", &[]),
     ("freerange-splat", &["freerange-core"]),
     ("freerange-camera", &["freerange-core"]),
-    ("freerange-scene", &["freerange-camera"]),
+    ("freerange-scene", &["freerange-core", "freerange-camera"]),
     ("freerange-formats", &["freerange-core", "freerange-splat"]),
     (
         "freerange-serve",
@@ -52,8 +52,6 @@ const ROOMS: &[(&str, &[&str])] = &[
             "freerange-model",
             "freerange-fit",
             "freerange-data",
-            // For objects made on the fly.
-            "freerange-build",
         ],
     ),
     // Apart from the training it serves, so that an MPI library can be changed without compiling that again.
@@ -61,6 +59,7 @@ const ROOMS: &[(&str, &[&str])] = &[
     (
         "freerange",
         &[
+            "freerange-core",
             "freerange-splat",
             "freerange-camera",
             "freerange-raster",

@@ -1,4 +1,4 @@
-//! `freerange train` is killed again and again, and nothing comes of it.
+//! `freerange train` is killed again and again, and asked to end, and nothing comes of it.
 
 use std::{
     fs,
@@ -46,10 +46,10 @@ const SAVE_EVERY: u64 = 4;
 const STEPS: u64 = 90;
 const KILLS: u64 = 10;
 
-fn train(config: &Path, run: &Path) -> Child {
+fn train(config: &Path, run: &Path, save_every: u64) -> Child {
     Command::new(env!("CARGO_BIN_EXE_freerange"))
         .args(["train".as_ref(), config.as_os_str(), "-o".as_ref(), run.as_os_str()])
-        .args(["--save-every", &SAVE_EVERY.to_string()])
+        .args(["--save-every", &save_every.to_string()])
         .stdout(Stdio::null())
         .stderr(Stdio::null())
         .spawn()
@@ -85,12 +85,12 @@ fn killed_at_ten_points_it_learns_what_it_would_have() {
     let place = tempfile::tempdir().unwrap();
     let path = |name: &str| -> PathBuf { place.path().join(name) };
     fs::write(path("config.toml"), CONFIG).unwrap();
-    assert!(train(&path("config.toml"), &path("whole")).wait().unwrap().success());
+    assert!(train(&path("config.toml"), &path("whole"), SAVE_EVERY).wait().unwrap().success());
     assert_eq!(saved(&path("whole")), STEPS);
 
     let run = path("killed");
     for kill in 1..=KILLS {
-        let mut child = train(&path("config.toml"), &run);
+        let mut child = train(&path("config.toml"), &run, SAVE_EVERY);
         let begin = Instant::now();
         // After another state, and then at once, or while it steps or writes the next.
         while saved(&run) < kill * SAVE_EVERY {
@@ -104,9 +104,28 @@ fn killed_at_ten_points_it_learns_what_it_would_have() {
     }
     let reached = saved(&run);
     assert!((KILLS * SAVE_EVERY..STEPS).contains(&reached), "killed for the last time at step {reached}");
-    assert!(train(&path("config.toml"), &run).wait().unwrap().success());
+    assert!(train(&path("config.toml"), &run, SAVE_EVERY).wait().unwrap().success());
     let (expected, found) = (outcome(&path("whole")), outcome(&run));
     assert!(expected.0 == found.0 && expected.1 == found.1, "other weights");
     assert_eq!(expected.2, found.2);
     assert_eq!(found.2.len() as u64, STEPS + STEPS / 5);
+
+    #[cfg(unix)]
+    {
+        let run = path("asked");
+        let mut child = train(&path("config.toml"), &run, STEPS);
+        let begin = Instant::now();
+        while !run.join("log.jsonl").exists() {
+            assert!(begin.elapsed() < Duration::from_secs(300), "it does not begin");
+            thread::sleep(Duration::from_millis(1));
+        }
+        let asked = Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap();
+        assert!(asked.success());
+        assert_eq!(child.wait().unwrap().code(), Some(130));
+        assert!((1..STEPS).contains(&saved(&run)), "asked to end, it saved step {}", saved(&run));
+        assert!(train(&path("config.toml"), &run, STEPS).wait().unwrap().success());
+        let found = outcome(&run);
+        assert!(expected.0 == found.0 && expected.1 == found.1, "other weights after it was asked to end");
+        assert_eq!(expected.2, found.2);
+    }
 }

@@ -1,12 +1,14 @@
 //! What a folder of shards is told.
 
+use std::sync::Arc;
+
 use freerange_camera::SelectionConfig;
 use freerange_core::{Invalid, check};
-use freerange_data::ImageFormat;
 use freerange_data::layout::MAX_DEPTH;
+use freerange_data::{DataError, ImageFormat, Making, ObjectSource};
 use freerange_mesh::LoadLimits;
 
-use crate::{BuildError, ObjectConfig};
+use crate::{BuildError, Generated, ObjectConfig};
 
 /// What is stored of each object, and how objects are divided.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
@@ -106,5 +108,71 @@ impl BuildConfig {
         check(ascending && !self.depths.is_empty(), "depths", &expected, &self.depths)?;
         self.shard.validate()?;
         self.object.validate()
+    }
+}
+
+/// What the `[data]` of a training configuration says of how objects are made, on the fly and in shards.
+#[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct MakingConfig {
+    /// How an object is made: its Gaussians, views and cameras.
+    pub object: ObjectConfig,
+    /// What shards keep of each object, and how objects are divided.
+    pub shard: ShardConfig,
+    /// What objects in shards have that there is no time for on the fly.
+    pub build: BuildOverrides,
+    /// Depths of the slices in shards, ascending; empty: those of training.
+    pub depths: Vec<u32>,
+    /// What mesh files may be like.
+    pub mesh: LoadLimits,
+}
+
+/// Fields of [`ObjectConfig`] that are different for objects in shards.
+#[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct BuildOverrides {
+    /// Views per object.
+    pub views: Option<usize>,
+    /// Gradient steps that adapt each slice to the views.
+    pub polish: Option<usize>,
+    /// Quick fits of some of the views per object.
+    pub input_fits: Option<usize>,
+}
+
+impl MakingConfig {
+    /// How shards are made for training with this seed and slices at these depths.
+    pub fn build_config(&self, seed: u64, depths: &[u32]) -> BuildConfig {
+        let mut object = self.object.clone();
+        object.views = self.build.views.unwrap_or(object.views);
+        object.polish = self.build.polish.unwrap_or(object.polish);
+        object.input_fits = self.build.input_fits.unwrap_or(object.input_fits);
+        BuildConfig {
+            seed,
+            depths: if self.depths.is_empty() { depths.to_vec() } else { self.depths.clone() },
+            shard: self.shard.clone(),
+            object,
+            mesh: self.mesh.clone(),
+        }
+    }
+}
+
+impl Making for MakingConfig {
+    const FIELDS: &[&str] = &["object", "shard", "build", "depths", "mesh"];
+
+    fn check(&self, seed: u64, depths: &[u32]) -> Result<(), DataError> {
+        let shards = || self.build_config(seed, depths).validate();
+        self.object.validate().and_then(|()| shards()).map_err(DataError::from_source)
+    }
+
+    fn views(&self) -> usize {
+        self.object.views
+    }
+
+    fn input_fits(&self) -> usize {
+        self.object.input_fits
+    }
+
+    fn source(&self, depths: Vec<u32>, seed: u64) -> Arc<dyn ObjectSource> {
+        Arc::new(Generated { config: self.object.clone(), depths, seed })
     }
 }

@@ -2,11 +2,11 @@
 
 use freerange_core::Invalid;
 use freerange_data::Object;
+use freerange_fit::{over_white, render_over_white};
 use freerange_splat::Cloud;
 use image::{Rgb, RgbImage, RgbaImage};
 
 use crate::BuildError;
-use crate::quality::{over_white, render_over_white};
 
 /// Gap between pictures on a contact sheet, in pixels.
 const GAP: u32 = 2;

@@ -73,8 +73,8 @@ const POLISH_RATES: Rates = Rates { mean: 3e-3, scale: 1e-2, rotation: 1e-3, opa
 mod tests {
     use super::*;
     use crate::object::Seconds;
-    use crate::quality::psnr_over_white;
     use crate::tests::tiny_config;
+    use freerange_fit::psnr_over_white;
     use freerange_splat::LodTree;
 
     #[test]

@@ -71,9 +71,9 @@ fn draw_set(centers: &[DVec3], set: (usize, Spread), rng: &mut ChaCha8Rng) -> Re
 mod tests {
     use super::*;
     use crate::generate_object;
-    use crate::quality::psnr_over_white;
     use crate::tests::tiny_config;
     use freerange_fit::QuickFitConfig;
+    use freerange_fit::psnr_over_white;
     use freerange_splat::Cloud;
 
     #[test]

@@ -21,7 +21,7 @@ mod tests;
 mod validate;
 
 pub use build::{BuildOptions, Done, Summary, build, collect, merge, render_views};
-pub use config::{BuildConfig, ShardConfig};
+pub use config::{BuildConfig, BuildOverrides, MakingConfig, ShardConfig};
 pub use contact_sheet::contact_sheet;
 pub use error::BuildError;
 pub use estimate::{Estimate, estimate};
@@ -30,5 +30,5 @@ pub use freerange_mesh::LoadLimits;
 pub use gallery::{GalleryConfig, gallery};
 pub use items::{Item, Items};
 pub use object::{GaussianSource, Generated, ObjectConfig, Seconds, generate_object};
-pub use quality::{CountQuality, Quality, measure_quality, psnr_over_white};
+pub use quality::{CountQuality, Quality, measure_quality};
 pub use surface::{SurfaceConfig, surface_gaussians};

@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use freerange_camera::{Camera, View};
 use freerange_data::{DataError, HeldOutPsnr, Object, ObjectSource};
-use freerange_fit::{FitConfig, QuickFitConfig};
+use freerange_fit::{FitConfig, QuickFitConfig, psnr_over_white};
 use freerange_generate::{GeneratorConfig, generate};
 use freerange_mesh::Mesh;
 use freerange_render::{CameraConfig, LightingConfig, Scene, orbit_cameras, render};
@@ -15,7 +15,6 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::fitted::{fitted_gaussians, polished};
 use crate::input_fit::input_fits;
-use crate::quality::psnr_over_white;
 use crate::{BuildError, SurfaceConfig, surface_gaussians};
 
 /// Where an object's Gaussians come from.

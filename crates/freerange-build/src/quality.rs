@@ -2,22 +2,15 @@
 
 use std::time::Instant;
 
-use freerange_camera::{Camera, View};
 use freerange_core::check;
-use freerange_fit::FitConfig;
-use freerange_metrics::psnr;
-use freerange_raster::RasterConfig;
+use freerange_fit::{FitConfig, psnr_over_white};
 use freerange_splat::{Cloud, LodTree};
-use image::RgbaImage;
 
 use crate::build::{mesh_of, seed_of};
 use crate::fitted::{fitted_gaussians, polished};
 use crate::items::Item;
 use crate::object::{Photographed, Seconds, add_elapsed};
 use crate::{BuildConfig, BuildError, ObjectConfig, SurfaceConfig, surface_gaussians};
-
-/// Renders that agree to the last bit would have infinite PSNR; this keeps means finite.
-const BEST_PSNR: f64 = 100.0;
 
 /// How well Gaussians show an object: PSNR in dB over held-out views, over white.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
@@ -107,33 +100,6 @@ pub fn measure_quality(item: &Item, config: &BuildConfig, counts: &[usize]) -> R
     Ok(Quality { id: item.id.clone(), triangles, gaussians: full_cloud.len(), full, full_seconds, by_count })
 }
 
-/// PSNR in dB of renders of `cloud` against `views`, in front of white: mean over the views.
-///
-/// # Errors
-/// What the rasteriser refuses.
-pub fn psnr_over_white(cloud: &Cloud, views: &[View]) -> Result<f64, BuildError> {
-    let mut sum = 0.0;
-    for view in views {
-        sum += psnr(&render_over_white(cloud, &view.camera)?, &over_white(&view.image))?.min(BEST_PSNR);
-    }
-    Ok(sum / views.len() as f64)
-}
-
-/// `cloud` in front of white, clamped to 0..1, sRGB-encoded. `[h, w, 3]`
-pub(crate) fn render_over_white(cloud: &Cloud, camera: &Camera) -> Result<Vec<f32>, BuildError> {
-    let image = freerange_raster::render(cloud.rows(), &[*camera], &[[1.0; 3]], &RasterConfig::default())?;
-    Ok(image.rgb.into_iter().map(|v| v.clamp(0.0, 1.0)).collect())
-}
-
-/// `image` in front of white, 0..1, sRGB-encoded. `[h, w, 3]`
-pub(crate) fn over_white(image: &RgbaImage) -> Vec<f32> {
-    let pixel = |p: &image::Rgba<u8>| {
-        let [r, g, b, a] = p.0.map(|v| f32::from(v) / 255.0);
-        [r, g, b].map(|c| c * a + (1.0 - a))
-    };
-    image.pixels().flat_map(pixel).collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -163,14 +129,5 @@ mod tests {
         }
         config.shard.held_out = 0;
         assert!(measure_quality(&item, &config, &[16]).unwrap_err().to_string().contains("held_out"));
-    }
-
-    #[test]
-    fn white_shows_through_transparency() {
-        let image = RgbaImage::from_pixel(1, 1, image::Rgba([255, 0, 51, 51]));
-        let found = over_white(&image);
-        for (found, expected) in found.iter().zip([1.0, 0.8, 0.84]) {
-            assert!((found - expected).abs() < 1e-6);
-        }
     }
 }

@@ -2,6 +2,8 @@
 
 use std::path::PathBuf;
 
+use freerange_core::IoError;
+
 /// Where in a scene description something was found.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Place {
@@ -23,13 +25,8 @@ impl std::fmt::Display for Place {
 #[non_exhaustive]
 pub enum CameraError {
     /// A file or folder cannot be read.
-    #[error("cannot read {}", file.display())]
-    Read {
-        /// The file.
-        file: PathBuf,
-        /// The system's reason.
-        source: std::io::Error,
-    },
+    #[error("cannot read {0}")]
+    Read(#[from] IoError),
     /// A folder holds no scene description.
     #[error("{}: expected transforms.json or transforms_train.json in this folder, found {found}", folder.display())]
     NoScene {

@@ -25,4 +25,4 @@ pub use sample::Metadata;
 pub use shard::ShardReader;
 pub use shards::Shards;
 pub use store::{NewFile, Store};
-pub use stream::{ObjectSource, Stream};
+pub use stream::{Making, ObjectSource, Stream};

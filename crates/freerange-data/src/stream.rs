@@ -1,9 +1,10 @@
 //! Objects in order, made ahead of time by other threads.
 
-use std::{sync::Arc, thread};
+use std::{fmt::Debug, sync::Arc, thread};
 
 use crossbeam_channel::{Receiver, bounded};
 use freerange_splat::Statistics;
+use serde::{Serialize, de::DeserializeOwned};
 
 use crate::{DataError, Object};
 
@@ -16,6 +17,27 @@ pub trait ObjectSource: Send + Sync {
     fn statistics(&self, _depth: u32) -> Option<Statistics> {
         None
     }
+}
+
+/// How objects are made that are in no shard, as a configuration says it. Whoever trains says who makes them.
+pub trait Making: Clone + Debug + Default + PartialEq + Serialize + DeserializeOwned {
+    /// The fields of a configuration's `[data]` that say it; all others are training's.
+    const FIELDS: &[&str];
+
+    /// Refuses impossible values.
+    ///
+    /// # Errors
+    /// Names the field. `seed` and `depths` are those of training.
+    fn check(&self, seed: u64, depths: &[u32]) -> Result<(), DataError>;
+
+    /// Views of each object.
+    fn views(&self) -> usize;
+
+    /// Quick fits of each object.
+    fn input_fits(&self) -> usize;
+
+    /// Objects with slices at `depths`, the first one of `seed`.
+    fn source(&self, depths: Vec<u32>, seed: u64) -> Arc<dyn ObjectSource>;
 }
 
 /// Objects `first`, `first + 1`, ... of a source, in order, or every so many of them, made by threads that stay a little ahead.

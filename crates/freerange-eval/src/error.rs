@@ -1,17 +1,14 @@
 use std::path::PathBuf;
 
+use freerange_core::IoError;
+
 /// Why something cannot be evaluated or reported.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum EvalError {
     /// Reading or writing failed.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// The file or folder.
-        path: PathBuf,
-        /// The reason.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    Io(#[from] IoError),
     /// A file or folder is not what it should be.
     #[error("{}: expected {expected}, found {found}", path.display())]
     File {
@@ -64,11 +61,6 @@ pub enum EvalError {
 }
 
 impl EvalError {
-    pub(crate) fn io(path: &std::path::Path) -> impl FnOnce(std::io::Error) -> Self {
-        let path = path.to_path_buf();
-        move |source| Self::Io { path, source }
-    }
-
     pub(crate) fn file(path: &std::path::Path, expected: impl Into<String>, found: impl ToString) -> Self {
         Self::File { path: path.into(), expected: expected.into(), found: found.to_string() }
     }

@@ -9,7 +9,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use freerange_core::write_atomically;
+use freerange_core::{IoError, write_atomically};
 use serde_json::Value;
 
 use crate::{
@@ -41,10 +41,10 @@ impl RunFolder {
             let mut entries = match fs::read_dir(path) {
                 Ok(entries) => entries,
                 Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
-                    fs::create_dir_all(path).map_err(EvalError::io(path))?;
-                    fs::read_dir(path).map_err(EvalError::io(path))?
+                    fs::create_dir_all(path).map_err(IoError::at(path))?;
+                    fs::read_dir(path).map_err(IoError::at(path))?
                 }
-                Err(e) => return Err(EvalError::io(path)(e)),
+                Err(e) => return Err(IoError::at(path)(e).into()),
             };
             if let Some(Ok(entry)) = entries.next() {
                 let found = format!("{:?} and no {SETTINGS}", entry.file_name());
@@ -60,7 +60,7 @@ impl RunFolder {
             }
         }
         let objects = path.join(OBJECTS);
-        fs::create_dir_all(&objects).map_err(EvalError::io(&objects))?;
+        fs::create_dir_all(&objects).map_err(IoError::at(&objects))?;
         folder.write_json(SETTINGS, settings)?;
         Ok(folder)
     }
@@ -70,13 +70,13 @@ impl RunFolder {
         for name in [SETTINGS, "report.json", "report.md", "report.html"] {
             let file = self.path.join(name);
             match fs::remove_file(&file) {
-                Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(EvalError::io(&file)(e)),
+                Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(IoError::at(&file)(e).into()),
                 _ => {}
             }
         }
         let objects = self.path.join(OBJECTS);
         if objects.is_dir() {
-            fs::remove_dir_all(&objects).map_err(EvalError::io(&objects))?;
+            fs::remove_dir_all(&objects).map_err(IoError::at(&objects))?;
         }
         Ok(())
     }
@@ -144,7 +144,7 @@ impl RunFolder {
     /// [`EvalError::Io`]; [`EvalError::File`] where there is another number of them.
     pub fn features(&self, case: &Case, count: usize) -> Result<Vec<f32>, EvalError> {
         let file = self.file(case, "f32");
-        let bytes = fs::read(&file).map_err(EvalError::io(&file))?;
+        let bytes = fs::read(&file).map_err(IoError::at(&file))?;
         if bytes.len() != count.saturating_mul(4) {
             return Err(EvalError::file(&file, format!("{count} features"), format!("{} bytes", bytes.len())));
         }
@@ -160,7 +160,7 @@ impl RunFolder {
         match fs::read(&file) {
             Ok(bytes) => Ok(Some(bytes)),
             Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(None),
-            Err(e) => Err(EvalError::io(&file)(e)),
+            Err(e) => Err(IoError::at(&file)(e).into()),
         }
     }
 
@@ -182,7 +182,7 @@ impl RunFolder {
 }
 
 fn write(path: &Path, bytes: &[u8]) -> Result<(), EvalError> {
-    write_atomically(path, |file| file.write_all(bytes)).map_err(EvalError::io(path))
+    Ok(write_atomically(path, |file| file.write_all(bytes)).map_err(IoError::at(path))?)
 }
 
 fn to_json(value: &impl serde::Serialize) -> Vec<u8> {
@@ -193,11 +193,11 @@ fn to_json(value: &impl serde::Serialize) -> Vec<u8> {
 
 /// Reads a JSON file that anyone may have written.
 pub(crate) fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, EvalError> {
-    let length = fs::metadata(path).map_err(EvalError::io(path))?.len();
+    let length = fs::metadata(path).map_err(IoError::at(path))?.len();
     if length > LARGEST {
         return Err(EvalError::file(path, format!("at most {LARGEST} bytes"), length));
     }
-    let bytes = fs::read(path).map_err(EvalError::io(path))?;
+    let bytes = fs::read(path).map_err(IoError::at(path))?;
     serde_json::from_slice(&bytes).map_err(|e| EvalError::file(path, "JSON of this program", e))
 }
 

@@ -135,7 +135,8 @@ impl Scorer {
                 return Err(EvalError::Object { object: "render".into(), expected: "finite values".into(), found });
             }
         }
-        let pairs_scored = pairs.par_iter().map(pixel).collect::<Result<Vec<_>, EvalError>>()?;
+        let pairs_scored =
+            pairs.par_iter().map(pixel).collect::<Vec<_>>().into_iter().collect::<Result<Vec<_>, EvalError>>()?;
         #[allow(unused_mut)] // without networks there is nothing to add
         let mut scores = Scores { pairs: pairs_scored, features: Vec::new() };
         #[cfg(feature = "networks")]

@@ -1,7 +1,7 @@
 //! What a fit can be told, with its defaults.
 
 use crate::FitError;
-pub use freerange_core::Background;
+pub use freerange_core::{Background, Invalid};
 use serde::{Deserialize, Serialize};
 
 /// Learning rate of each kind of channel, per step of Adam.
@@ -176,7 +176,7 @@ pub(crate) fn check(
     found: impl std::fmt::Display,
     ok: bool,
 ) -> Result<(), FitError> {
-    if ok { Ok(()) } else { Err(FitError::Config { field, expected: expected.into(), found: found.to_string() }) }
+    if ok { Ok(()) } else { Err(Invalid::new(field, expected, found).into()) }
 }
 
 fn finite_not_negative(field: &'static str, v: f64) -> Result<(), FitError> {

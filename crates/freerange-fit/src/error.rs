@@ -1,5 +1,7 @@
 //! The crate's error.
 
+use freerange_core::Invalid;
+
 /// Why a fit cannot start or go on.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -23,15 +25,8 @@ pub enum FitError {
         found: String,
     },
     /// A configuration value is impossible.
-    #[error("{field}: expected {expected}, found {found}")]
-    Config {
-        /// The field.
-        field: &'static str,
-        /// What it may be.
-        expected: String,
-        /// What it is.
-        found: String,
-    },
+    #[error(transparent)]
+    Config(#[from] Invalid),
     /// The optimisation left the finite numbers.
     #[error("step {step}: {what} is not finite; smaller learning rates may help")]
     Diverged {

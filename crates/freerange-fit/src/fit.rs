@@ -9,6 +9,7 @@ use crate::{
     views::Targets,
 };
 use freerange_camera::View;
+use freerange_core::Invalid;
 use freerange_splat::Cloud;
 use rand::{SeedableRng, seq::SliceRandom};
 use rand_chacha::ChaCha8Rng;
@@ -89,7 +90,7 @@ pub(crate) fn checked(cloud: &Cloud, most: usize) -> Result<Cloud, FitError> {
     cloud.check_finite()?;
     if cloud.len() > most {
         let expected = format!("at least the {} Gaussians to start from", cloud.len());
-        return Err(FitError::Config { field: "cap_max", expected, found: most.to_string() });
+        return Err(Invalid::new("cap_max", expected, most).into());
     }
     let mut cloud = cloud.clone();
     cloud.canonicalize_rotations();

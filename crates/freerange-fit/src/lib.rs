@@ -2,6 +2,7 @@
 //!
 //! * [`fit`]: from nothing but views (Kheradmand et al. 2024), which is how training objects become clouds.
 //! * [`frame_of`]: where a fit says the object is.
+//! * [`psnr_over_white`]: how well Gaussians show what views show.
 //! * [`refine`]: the same from a cloud that is already good, held where no view looks.
 //!
 //! Plain Rust over the rasteriser's CPU functions; no tensor library.
@@ -15,6 +16,7 @@ mod hold;
 mod init;
 mod mcmc;
 mod objective;
+mod quality;
 mod quick;
 mod refine;
 #[cfg(test)]
@@ -25,6 +27,7 @@ pub use config::{Background, FitConfig, HoldConfig, Rates, RefineConfig};
 pub use error::FitError;
 pub use fit::fit;
 pub use frame::frame_of;
+pub use quality::{over_white, psnr_over_white, render_over_white};
 pub use quick::{QuickFitConfig, quick_fit, tree_slice};
 pub use refine::refine;
 

@@ -6,7 +6,7 @@ use std::process::Command;
 
 use burn::tensor::Device;
 use freerange_flow::{
-    config::{Stage, TrainConfig},
+    config::{self, Stage},
     trainer::Trainer,
 };
 
@@ -22,7 +22,8 @@ fn main() {
         "| stage | samples/step | s/step | steps/s | waiting for data | CPU s/step | of which system | page faults/step |"
     );
     println!("|---|---|---|---|---|---|---|---|");
-    let config = TrainConfig::load(path.as_ref()).expect("a valid configuration");
+    let config =
+        config::TrainConfig::<freerange_build::MakingConfig>::load(path.as_ref()).expect("a valid configuration");
     for stage in &config.stages {
         let mut one = config.clone();
         one.stages = vec![Stage { steps: u64::MAX / 2, ..stage.clone() }];

@@ -133,10 +133,7 @@ impl Batch {
     ) -> Result<Self, FlowError> {
         let (b, n) = (objects.len(), 1usize << stage.depth);
         let start = loss.start.filter(|start| rng.random::<f32>() < start.share);
-        let estimates = match rng.random::<f32>() < loss.self_conditioning {
-            true if loss.estimates > 1 => rng.random_range(1..=loss.estimates),
-            once => usize::from(once),
-        };
+        let estimates = draw_estimates(loss, rng);
         let held_at_start = start.filter(|start| start.hold > 0.0 && rng.random::<f32>() < start.hold);
         let fits = start.map(|_| same_fit(objects, stage.depth, loss.held_views, rng)).transpose()?;
         let inputs = rng.random_range(loss.input_views.0..=loss.input_views.1);
@@ -148,11 +145,7 @@ impl Batch {
             rows.draw(object, fits.as_ref().map(|fits| fits[i]), &common, rng)?;
         }
 
-        let at = |views: &[Vec<View>], size: u32| {
-            let small: Vec<Vec<View>> = views.iter().map(|o| o.iter().map(|v| shrink(v, size)).collect()).collect();
-            let small: Vec<Vec<&View>> = small.iter().map(|o| o.iter().collect()).collect();
-            Ok::<_, FlowError>(Images::new(&small, device)?.on(&rows.backgrounds))
-        };
+        let at = |views: &[Vec<View>], size: u32| targets(views, size, &rows.backgrounds, device);
         let render_size = stage.render_size.unwrap_or(loss.render_size);
         let seen: Vec<Vec<&View>> = rows.seen.iter().map(|o| o.iter().collect()).collect();
         let conditioning = Conditioning::new(&seen, model, device)?;
@@ -180,6 +173,21 @@ impl Batch {
             held,
         })
     }
+}
+
+/// How many estimates of its own the network is fed, one after the other.
+fn draw_estimates(loss: &LossConfig, rng: &mut ChaCha8Rng) -> usize {
+    match rng.random::<f32>() < loss.self_conditioning {
+        true if loss.estimates > 1 => rng.random_range(1..=loss.estimates),
+        once => usize::from(once),
+    }
+}
+
+/// Views at most `size` pixels wide and high, in front of each object's background.
+fn targets(views: &[Vec<View>], size: u32, backgrounds: &[[f32; 3]], device: &Device) -> Result<Targets, FlowError> {
+    let small: Vec<Vec<View>> = views.iter().map(|o| o.iter().map(|v| shrink(v, size)).collect()).collect();
+    let small: Vec<Vec<&View>> = small.iter().map(|o| o.iter().collect()).collect();
+    Ok(Images::new(&small, device)?.on(backgrounds))
 }
 
 /// What is the same for all objects of a batch.

@@ -2,8 +2,11 @@
 
 use std::path::Path;
 
-use freerange_build::{BuildConfig, LoadLimits, ObjectConfig, ShardConfig};
+use freerange_core::Invalid;
+use freerange_data::Making;
 use freerange_model::{Compute, ModelConfig};
+
+use serde::{Deserialize, de::Error};
 
 use crate::{
     FlowError, ValidationConfig,
@@ -13,17 +16,18 @@ use crate::{
     sample::{GradientAt, SampleConfig},
 };
 
-/// A whole training run.
+/// A whole training run, with what `M` knows of how its objects are made.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct TrainConfig {
+#[serde(deny_unknown_fields, bound(deserialize = "M: Making"))]
+pub struct TrainConfig<M = ()> {
     /// Seed of everything random: initial weights, objects, noise, times, views.
     #[serde(default)]
     pub seed: u64,
     /// The network.
     pub model: ModelConfig,
     /// The objects to train on.
-    pub data: DataConfig,
+    #[serde(deserialize_with = "data")]
+    pub data: DataConfig<M>,
     /// The loss and its terms; each can be switched off (the paper's ablations).
     #[serde(default)]
     pub loss: LossConfig,
@@ -43,24 +47,14 @@ pub struct TrainConfig {
 
 /// Where training objects come from, and how they are used.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct DataConfig {
+#[serde(default, deny_unknown_fields, bound(deserialize = "M: Default"))]
+pub struct DataConfig<M = ()> {
     /// Shards made by `freerange data build`: a folder (in a file, its path is relative to the file), or a URL (`s3://`,
     /// `gs://`, `https://`). Without it, objects are generated on the fly, without end.
     pub shards: Option<String>,
     /// Train on the shards that are finished by now where the folder is still being made; a run that goes on later takes
     /// those of then, and is no longer the one never stopped.
     pub partial: bool,
-    /// How an object is made: its Gaussians, views and cameras.
-    pub object: ObjectConfig,
-    /// What shards keep of each object, and how objects are divided.
-    pub shard: ShardConfig,
-    /// What objects in shards have that there is no time for on the fly.
-    pub build: BuildOverrides,
-    /// Depths of the slices in shards, ascending; empty: those of the stages.
-    pub depths: Vec<u32>,
-    /// What mesh files may be like.
-    pub mesh: LoadLimits,
     /// Objects held in memory, from which each batch is drawn.
     pub window: usize,
     /// Objects that leave the window, and new ones that enter it, with every step.
@@ -73,37 +67,34 @@ pub struct DataConfig {
     pub lanes: usize,
     /// Objects over which the normalisation statistics are measured before training.
     pub statistics_objects: usize,
+    /// How objects are made. Its fields stand beside the others.
+    #[serde(flatten, skip_deserializing)]
+    pub making: M,
 }
 
-impl Default for DataConfig {
+impl<M: Default> Default for DataConfig<M> {
     fn default() -> Self {
         Self {
             shards: None,
             partial: false,
-            object: ObjectConfig::default(),
-            shard: ShardConfig::default(),
-            build: BuildOverrides::default(),
-            depths: Vec::new(),
-            mesh: LoadLimits::default(),
             window: 64,
             fresh: 2,
             workers: 1,
             lanes: 1,
             statistics_objects: 256,
+            making: M::default(),
         }
     }
 }
 
-/// Fields of [`ObjectConfig`] that are different for objects in shards.
-#[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct BuildOverrides {
-    /// Views per object.
-    pub views: Option<usize>,
-    /// Gradient steps that adapt each slice to the views.
-    pub polish: Option<usize>,
-    /// Quick fits of some of the views per object.
-    pub input_fits: Option<usize>,
+/// Reads `[data]`: its fields of training, and those that belong to whoever makes objects.
+fn data<'de, D: serde::Deserializer<'de>, M: Making>(deserializer: D) -> Result<DataConfig<M>, D::Error> {
+    let mut training = toml::Table::deserialize(deserializer)?;
+    let making: toml::Table = M::FIELDS.iter().filter_map(|field| training.remove_entry(*field)).collect();
+    let wrong = |e: toml::de::Error| D::Error::custom(e.to_string().trim_end());
+    let making = M::deserialize(making).map_err(wrong)?;
+    let training: DataConfig<M> = training.try_into().map_err(wrong)?;
+    Ok(DataConfig { making, ..training })
 }
 
 /// The training loss (paper, Section 3.3).
@@ -348,24 +339,7 @@ impl Stage {
     }
 }
 
-impl TrainConfig {
-    /// Reads and checks a configuration: a file, or one of the repository's by its name (`tiny`, `base`, `paper`).
-    ///
-    /// A file may hold only what differs from another one, its `parent`: the name of one of the repository's, or a path
-    /// relative to the file. Tables are merged key by key; lists, the stages among them, are replaced whole.
-    ///
-    /// # Errors
-    /// [`FlowError::Io`]; [`FlowError::State`] where a file is no configuration or parents go in a circle; those of
-    /// [`validate`](Self::validate).
-    pub fn load(path: &Path) -> Result<Self, FlowError> {
-        let table = crate::inherit::load(path)?;
-        let config: Self = table
-            .try_into()
-            .map_err(|e: toml::de::Error| FlowError::State { path: path.into(), problem: e.to_string() })?;
-        config.validate()?;
-        Ok(config)
-    }
-
+impl<M> TrainConfig<M> {
     /// Whether this names a configuration of the repository.
     pub fn is_preset(path: &Path) -> bool {
         crate::inherit::PRESETS.iter().any(|(name, _)| path.as_os_str() == *name)
@@ -394,33 +368,43 @@ impl TrainConfig {
         depths
     }
 
-    /// How shards for this training are made.
-    pub fn build_config(&self) -> BuildConfig {
-        let data = &self.data;
-        let mut object = data.object.clone();
-        object.views = data.build.views.unwrap_or(object.views);
-        object.polish = data.build.polish.unwrap_or(object.polish);
-        object.input_fits = data.build.input_fits.unwrap_or(object.input_fits);
-        BuildConfig {
-            seed: self.seed,
-            depths: if data.depths.is_empty() { self.depths() } else { data.depths.clone() },
-            shard: data.shard.clone(),
-            object,
-            mesh: data.mesh.clone(),
-        }
+    /// The same without how objects are made, and that.
+    pub fn apart(self) -> (TrainConfig, M) {
+        let Self { seed, model, data, loss, optimizer, stages, validation, sample } = self;
+        let DataConfig { shards, partial, window, fresh, workers, lanes, statistics_objects, making } = data;
+        let data = DataConfig { shards, partial, window, fresh, workers, lanes, statistics_objects, making: () };
+        (TrainConfig { seed, model, data, loss, optimizer, stages, validation, sample }, making)
+    }
+}
+
+impl<M: Making> TrainConfig<M> {
+    /// Reads and checks a configuration: a file, or one of the repository's by its name (`tiny`, `base`, `paper`).
+    ///
+    /// A file may hold only what differs from another one, its `parent`: the name of one of the repository's, or a path
+    /// relative to the file. Tables are merged key by key; lists, the stages among them, are replaced whole.
+    ///
+    /// # Errors
+    /// [`FlowError::Io`]; [`FlowError::State`] where a file is no configuration or parents go in a circle; those of
+    /// [`validate`](Self::validate).
+    pub fn load(path: &Path) -> Result<Self, FlowError> {
+        let table = crate::inherit::load(path)?;
+        let config: Self = table
+            .try_into()
+            .map_err(|e: toml::de::Error| FlowError::State { path: path.into(), problem: e.to_string() })?;
+        config.validate()?;
+        Ok(config)
     }
 
     /// Refuses impossible values.
     pub fn validate(&self) -> Result<(), FlowError> {
         let check = |ok: bool, field: &str, expected: &str, found: String| match ok {
             true => Ok(()),
-            false => Err(FlowError::Config { field: field.into(), expected: expected.into(), found }),
+            false => Err(Invalid::new(field, expected, found)),
         };
         self.model.validate()?;
         self.sample.validate()?;
-        self.data.object.validate()?;
-        self.build_config().validate()?;
         check(!self.stages.is_empty(), "stage", "at least one [[stage]]", "none".into())?;
+        self.data.making.check(self.seed, &self.depths())?;
         for s in &self.stages {
             check((1..=20).contains(&s.depth), "stage.depth", "1 to 20", s.depth.to_string())?;
             check(s.batch > 0, "stage.batch", "at least 1", s.batch.to_string())?;
@@ -447,7 +431,7 @@ impl TrainConfig {
         check((1..=10_000).contains(&v.objects), "validation.objects", "1 to 10000", v.objects.to_string())?;
         let l = &self.loss;
         let (low, high) = l.input_views;
-        let views = self.data.object.views;
+        let views = self.data.making.views();
         check(low >= 1 && low <= high, "loss.input_views", "[fewest, most], at least 1", format!("[{low}, {high}]"))?;
         check(
             views >= high + l.held_views,
@@ -494,7 +478,7 @@ impl TrainConfig {
                 "false with loss.start, whose fits are in the tree's order",
                 "true".into(),
             )?;
-            let made = self.data.shards.is_some() || self.data.object.input_fits > 0;
+            let made = self.data.shards.is_some() || self.data.making.input_fits() > 0;
             check(made, "data.object.input_fits", "at least 1 with loss.start", "0".into())?;
         }
         for (field, value) in

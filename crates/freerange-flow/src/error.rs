@@ -1,5 +1,7 @@
 use std::path::PathBuf;
 
+use freerange_core::{Invalid, IoError};
+
 /// What can go wrong in training and sampling.
 #[derive(Debug, thiserror::Error)]
 pub enum FlowError {
@@ -28,15 +30,8 @@ pub enum FlowError {
     #[error("no gradient reached the Gaussians")]
     NoGradient,
     /// A configuration field has an impossible value.
-    #[error("{field}: expected {expected}, found {found}")]
-    Config {
-        /// The field, as in the file.
-        field: String,
-        /// What it may be.
-        expected: String,
-        /// What it is.
-        found: String,
-    },
+    #[error(transparent)]
+    Config(#[from] Invalid),
     /// The loss or the gradients have stopped being numbers.
     #[error(
         "step {last}: expected a finite loss and finite gradients, found a loss of {loss} and gradients of norm {norm}, as in \
@@ -61,13 +56,8 @@ pub enum FlowError {
         problem: String,
     },
     /// Reading or writing failed.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// The reason.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    Io(#[from] IoError),
     /// Processes that train together could not speak with each other.
     #[error("ranks: {problem}")]
     Ranks {
@@ -104,7 +94,7 @@ pub enum FlowError {
     /// The training data.
     #[error(transparent)]
     Data(#[from] freerange_data::DataError),
-    /// Objects made on the fly.
+    /// Quick fits that sampling starts from, or how samples are measured.
     #[error(transparent)]
-    Build(#[from] freerange_build::BuildError),
+    Fit(#[from] freerange_fit::FitError),
 }

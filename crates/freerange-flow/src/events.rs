@@ -10,7 +10,7 @@ use std::{
     time::{Duration, Instant, SystemTime},
 };
 
-use freerange_core::write_atomically;
+use freerange_core::{IoError, write_atomically};
 use image::RgbaImage;
 
 use crate::FlowError;
@@ -35,26 +35,22 @@ impl Events {
     /// # Errors
     /// [`FlowError::Io`].
     pub fn open(folder: &Path, step: u64) -> Result<Self, FlowError> {
-        let at = |path: &Path| {
-            let path = path.to_path_buf();
-            move |source| FlowError::Io { path: path.clone(), source }
-        };
-        for entry in std::fs::read_dir(folder).map_err(at(folder))? {
-            let path = entry.map_err(at(folder))?.path();
+        for entry in std::fs::read_dir(folder).map_err(IoError::at(folder))? {
+            let path = entry.map_err(IoError::at(folder))?.path();
             let Some(first) = path.file_name().and_then(|name| first_step(name.to_str()?)) else { continue };
             if first >= step {
-                std::fs::remove_file(&path).map_err(at(&path))?;
+                std::fs::remove_file(&path).map_err(IoError::at(&path))?;
                 continue;
             }
-            let old = std::fs::read(&path).map_err(at(&path))?;
+            let old = std::fs::read(&path).map_err(IoError::at(&path))?;
             let kept: Vec<&[u8]> = Records(&old).filter(|record| step_of(record).is_some_and(|s| s <= step)).collect();
             if kept.iter().map(|record| record.len()).sum::<usize>() < old.len() {
                 let written = write_atomically(&path, |file| kept.iter().try_for_each(|r| file.write_all(r)));
-                written.map_err(at(&path))?;
+                written.map_err(IoError::at(&path))?;
             }
         }
         let path = folder.join(format!("{NAME}{step:010}{OURS}"));
-        let file = BufWriter::new(File::create(&path).map_err(at(&path))?);
+        let file = BufWriter::new(File::create(&path).map_err(IoError::at(&path))?);
         let mut events = Self { path, file, flushed: Instant::now() };
         // Every file begins with its version.
         events.add(step, |event| event.bytes(3, b"brain.Event:2"))?;
@@ -126,7 +122,7 @@ impl Events {
     }
 
     fn failed(&self, source: std::io::Error) -> FlowError {
-        FlowError::Io { path: self.path.clone(), source }
+        IoError::at(&self.path)(source).into()
     }
 }
 

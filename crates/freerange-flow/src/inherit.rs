@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use freerange_core::IoError;
 use toml::{Table, Value};
 
 use crate::FlowError;
@@ -28,8 +29,8 @@ pub(crate) fn load(path: &Path) -> Result<Table, FlowError> {
         let (identity, text) = match preset {
             Some((_, text)) => (path.clone(), text.to_string()),
             None => {
-                let io = |source| FlowError::Io { path: path.clone(), source };
-                (path.canonicalize().map_err(io)?, std::fs::read_to_string(&path).map_err(io)?)
+                let identity = path.canonicalize().map_err(IoError::at(&path))?;
+                (identity, std::fs::read_to_string(&path).map_err(IoError::at(&path))?)
             }
         };
         if chain.iter().any(|(seen, _)| *seen == identity) {
@@ -123,7 +124,7 @@ mod tests {
     use std::fs;
 
     use super::*;
-    use crate::config::TrainConfig;
+    type TrainConfig = crate::config::TrainConfig<freerange_build::MakingConfig>;
 
     fn place(files: &[(&str, &str)]) -> tempfile::TempDir {
         let folder = tempfile::tempdir().unwrap();
@@ -209,6 +210,9 @@ mod tests {
             ("half.toml", "seed = "),
             ("typo.toml", "parent = \"tiny\"\nloss.hold = false"),
             ("scalar.toml", "parent = \"tiny\"\nloss = 3"),
+            ("stray.toml", "parent = \"tiny\"\ndata.windw = 3"),
+            ("making.toml", "parent = \"tiny\"\ndata.object.veiws = 3"),
+            ("value.toml", "parent = \"tiny\"\ndata.object.samples_per_axis = 99"),
         ];
         let folder = place(&files);
         let error = |name: &str| TrainConfig::load(&folder.path().join(name)).unwrap_err().to_string();
@@ -221,6 +225,9 @@ mod tests {
             ("broken.toml", "half.toml"),
             ("typo.toml", "hold"),
             ("scalar.toml", "loss"),
+            ("stray.toml", "windw"),
+            ("making.toml", "veiws"),
+            ("value.toml", "object.samples_per_axis"),
         ] {
             assert!(error(name).contains(words), "{name}: {}", error(name));
         }

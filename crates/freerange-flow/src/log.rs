@@ -6,7 +6,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use freerange_core::write_atomically;
+use freerange_core::{IoError, write_atomically};
 
 use crate::FlowError;
 
@@ -24,17 +24,17 @@ impl Log {
     /// # Errors
     /// [`FlowError::Io`].
     pub fn open(path: &Path, step: u64) -> Result<Self, FlowError> {
-        let io = |source| FlowError::Io { path: path.into(), source };
         let old = match std::fs::read(path) {
             Ok(old) => old,
             Err(e) if e.kind() == std::io::ErrorKind::NotFound => Vec::new(),
-            Err(e) => return Err(io(e)),
+            Err(e) => return Err(IoError::at(path)(e).into()),
         };
         let kept: Vec<&[u8]> = old.split_inclusive(|&b| b == b'\n').filter(|line| is_of(line, step)).collect();
         if kept.iter().map(|line| line.len()).sum::<usize>() < old.len() {
-            write_atomically(path, |file| kept.iter().try_for_each(|line| file.write_all(line))).map_err(io)?;
+            write_atomically(path, |file| kept.iter().try_for_each(|line| file.write_all(line)))
+                .map_err(IoError::at(path))?;
         }
-        let file = File::options().create(true).append(true).open(path).map_err(io)?;
+        let file = File::options().create(true).append(true).open(path).map_err(IoError::at(path))?;
         Ok(Self { path: path.into(), file: BufWriter::new(file) })
     }
 
@@ -57,7 +57,7 @@ impl Log {
     }
 
     fn failed(&self, source: std::io::Error) -> FlowError {
-        FlowError::Io { path: self.path.clone(), source }
+        IoError::at(&self.path)(source).into()
     }
 }
 

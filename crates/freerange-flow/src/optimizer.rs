@@ -12,6 +12,7 @@ use burn::{
     module::{Module, ModuleMapper, ModuleVisitor, Param},
     tensor::{Device, Gradients, Tensor, TensorData},
 };
+use freerange_core::IoError;
 use multiversion::multiversion;
 use rayon::prelude::*;
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
@@ -223,7 +224,7 @@ impl AdamW {
     /// [`FlowError::State`], [`FlowError::Io`].
     pub fn load(path: &Path, weights: &Weights, device: &Device) -> Result<Self, FlowError> {
         let broken = |problem: String| FlowError::State { path: path.into(), problem };
-        let bytes = std::fs::read(path).map_err(|source| FlowError::Io { path: path.into(), source })?;
+        let bytes = std::fs::read(path).map_err(IoError::at(path))?;
         let file = SafeTensors::deserialize(&bytes).map_err(|e| broken(e.to_string()))?;
         let read = |name: String, len: usize| match file.tensor(&name) {
             Ok(t) if t.dtype() == Dtype::F32 && t.shape() == [len] => {

@@ -3,12 +3,12 @@
 use std::{ops::ControlFlow, sync::Arc};
 
 use burn::tensor::{Device, Tensor};
-use freerange_build::psnr_over_white;
 use freerange_camera::{
     View,
     image_ops::{composite, sheet, to_picture},
 };
 use freerange_data::{Object, ObjectSource};
+use freerange_fit::psnr_over_white;
 use freerange_model::{Checkpoint, FreeRange, ModelConfig};
 use freerange_raster::{RasterConfig, render};
 use freerange_splat::{Cloud, channel};

@@ -2,11 +2,10 @@
 #![cfg(any(feature = "cuda", feature = "metal", feature = "vulkan", feature = "webgpu"))]
 
 use burn::tensor::{Device, DeviceType, Tensor};
-use freerange_build::Generated;
+use freerange_build::{Generated, MakingConfig};
 use freerange_data::{Object, ObjectSource};
 use freerange_flow::{
     batch::{Batch, step_rng},
-    config::TrainConfig,
     photometric::Photometric,
     sample::reconstruct,
     train,
@@ -15,6 +14,8 @@ use freerange_flow::{
 use freerange_model::{Checkpoint, FreeRange};
 use freerange_splat::{Normalization, Statistics};
 use std::{ops::ControlFlow, sync::Arc};
+
+type TrainConfig = freerange_flow::config::TrainConfig<MakingConfig>;
 
 const SMALL: &str = r#"
 seed = 3
@@ -88,7 +89,7 @@ fn config() -> TrainConfig {
 }
 
 fn objects(config: &TrainConfig) -> Vec<Arc<Object>> {
-    let source = Generated { config: config.data.object.clone(), depths: config.depths(), seed: 11 };
+    let source = Generated { config: config.data.making.object.clone(), depths: config.depths(), seed: 11 };
     (0..2).map(|i| Arc::new(source.object(i).unwrap())).collect()
 }
 

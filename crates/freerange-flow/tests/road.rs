@@ -3,13 +3,13 @@
 use std::{ops::ControlFlow, sync::Arc};
 
 use burn::tensor::Device;
-use freerange_build::Generated;
+use freerange_build::{Generated, MakingConfig};
 use freerange_camera::{View, image_ops::composite};
 use freerange_data::ObjectSource;
 use freerange_flow::{
     FlowError,
     batch::{Batch, step_rng},
-    config::{FrameJitter, TrainConfig},
+    config::FrameJitter,
     photometric::{Photometric, Targets},
     sample::{Estimate, PhotometricStep, SampleConfig, reconstruct},
     trainer::{Initial, Trainer},
@@ -18,6 +18,8 @@ use freerange_metrics::psnr;
 use freerange_model::Checkpoint;
 use freerange_raster::{RasterConfig, render};
 use freerange_splat::{Cloud, Normalization, channel};
+
+type TrainConfig = freerange_flow::config::TrainConfig<MakingConfig>;
 
 /// A model that learns one object in about a minute.
 const ONE_OBJECT: &str = r#"
@@ -122,7 +124,7 @@ fn one_object_is_learned_sampled_and_rendered() {
     let device = Device::flex();
     let checkpoint = Checkpoint::load(&folder.path().join("checkpoint.safetensors"), &device).unwrap();
     let source = Generated {
-        config: config.data.object.clone(),
+        config: config.data.making.object.clone(),
         depths: config.depths(),
         seed: config.seed.wrapping_mul(1 << 32),
     };
@@ -252,7 +254,7 @@ fn an_initial_checkpoint_gives_its_statistics_unless_they_are_to_be_measured() {
         |folder: &tempfile::TempDir| Checkpoint::load(&folder.path().join("checkpoint.safetensors"), &device).unwrap();
     let checkpoint = load(&first);
     let mut other = config(1);
-    other.data.object.surface.opacity = 0.5;
+    other.data.making.object.surface.opacity = 0.5;
     for (folder, remeasure) in [(&second, false), (&third, true)] {
         let initial = Initial { checkpoint: &checkpoint, remeasure };
         Trainer::open(other.clone(), folder.path(), Some(initial), &device, |_| {}).unwrap().save().unwrap();
@@ -268,7 +270,7 @@ fn a_moved_frame_changes_nothing_that_is_seen() {
     let mut moved = still.clone();
     moved.loss.frame_jitter = FrameJitter { scale: 0.1, center: 0.1 };
     let device = Device::flex();
-    let source = Generated { config: still.data.object.clone(), depths: vec![6], seed: 5 };
+    let source = Generated { config: still.data.making.object.clone(), depths: vec![6], seed: 5 };
     let object = Arc::new(source.object(0).unwrap());
     let normalization = Normalization { mean: [0.0; channel::COUNT], std: [1.0; channel::COUNT] };
     let photometric = Photometric::new(&normalization, &device);
@@ -329,7 +331,7 @@ fn a_fit_is_mended() {
     let config: TrainConfig = toml::from_str(&text).unwrap();
     config.validate().unwrap();
     let source = Generated {
-        config: config.data.object.clone(),
+        config: config.data.making.object.clone(),
         depths: config.depths(),
         seed: config.seed.wrapping_mul(1 << 32),
     };

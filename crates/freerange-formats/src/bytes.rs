@@ -1,16 +1,18 @@
 //! Taking bytes apart without believing what they claim.
 
-use crate::error::Problem;
+use freerange_core::Invalid;
+
+use crate::error::problem;
 
 /// Decoded bytes per byte of a file, at most. Real files stay far below; hostile ones blow up a thousandfold.
 const MAX_EXPANSION: usize = 256;
 
 /// Refuses what would take more than [`MAX_EXPANSION`] times the memory of the file it comes from.
-pub fn check_expansion(field: &str, count: u64, bytes_each: usize, file: usize) -> Result<usize, Problem> {
+pub fn check_expansion(field: &str, count: u64, bytes_each: usize, file: usize) -> Result<usize, Invalid> {
     let limit = (file as u64).saturating_mul(MAX_EXPANSION as u64) / bytes_each as u64;
     match usize::try_from(count) {
         Ok(count) if count as u64 <= limit => Ok(count),
-        _ => Err(Problem::new(field, format!("at most {limit} in a file of {file} bytes"), count)),
+        _ => Err(problem(field, format!("at most {limit} in a file of {file} bytes"), count)),
     }
 }
 
@@ -20,23 +22,23 @@ pub struct Cursor<'a> {
 }
 
 impl<'a> Cursor<'a> {
-    pub fn take(&mut self, field: &str, count: usize) -> Result<&'a [u8], Problem> {
+    pub fn take(&mut self, field: &str, count: usize) -> Result<&'a [u8], Invalid> {
         let Some((taken, left)) = self.left.split_at_checked(count) else {
-            return Err(Problem::new(field, format!("{count} bytes"), format!("{} and the end", self.left.len())));
+            return Err(problem(field, format!("{count} bytes"), format!("{} and the end", self.left.len())));
         };
         self.left = left;
         Ok(taken)
     }
 
-    pub fn u8(&mut self, field: &str) -> Result<u8, Problem> {
+    pub fn u8(&mut self, field: &str) -> Result<u8, Invalid> {
         Ok(self.take(field, 1)?[0])
     }
 
-    pub fn u32(&mut self, field: &str) -> Result<u32, Problem> {
+    pub fn u32(&mut self, field: &str) -> Result<u32, Invalid> {
         Ok(u32::from_le_bytes(self.take(field, 4)?.try_into().expect("four bytes")))
     }
 
-    pub fn u64(&mut self, field: &str) -> Result<u64, Problem> {
+    pub fn u64(&mut self, field: &str) -> Result<u64, Invalid> {
         Ok(u64::from_le_bytes(self.take(field, 8)?.try_into().expect("eight bytes")))
     }
 }

@@ -2,6 +2,7 @@
 
 use std::collections::HashMap;
 
+use freerange_core::Invalid;
 use freerange_splat::{Cloud, channel};
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use serde::Deserialize;
@@ -10,7 +11,7 @@ use serde_json::Value;
 use crate::{
     Loaded,
     bytes::{Cursor, check_expansion},
-    error::Problem,
+    error::problem,
     glb::{BINARY, EXTENSION, JSON, MAGIC},
     quantize::{Row, color_of_sh, log_scale, logit, set_rotation},
 };
@@ -99,12 +100,12 @@ struct Similarity {
     translation: DVec3,
 }
 
-pub fn decode(bytes: &[u8]) -> Result<Loaded, Problem> {
+pub fn decode(bytes: &[u8]) -> Result<Loaded, Invalid> {
     let (json, binary) = chunks(bytes)?;
-    let gltf: Gltf = serde_json::from_slice(json).map_err(|e| Problem::new("JSON chunk", "glTF 2.0", e))?;
+    let gltf: Gltf = serde_json::from_slice(json).map_err(|e| problem("JSON chunk", "glTF 2.0", e))?;
     let known = [EXTENSION, "KHR_mesh_quantization"];
     if let Some(other) = gltf.extensions_required.iter().find(|e| !known.contains(&e.as_str())) {
-        return Err(Problem::new("extensionsRequired", known.join(" or "), other));
+        return Err(problem("extensionsRequired", known.join(" or "), other));
     }
     let file = File { gltf, binary, size: bytes.len() };
     let mut rows = Vec::new();
@@ -122,7 +123,7 @@ pub fn decode(bytes: &[u8]) -> Result<Loaded, Problem> {
     })?;
     if rows.is_empty() {
         let found = format!("{skipped} primitives without it");
-        return Err(Problem::new("scene", format!("a primitive with {EXTENSION}"), found));
+        return Err(problem("scene", format!("a primitive with {EXTENSION}"), found));
     }
     let mut notes = Vec::new();
     if skipped > 0 {
@@ -136,18 +137,18 @@ pub fn decode(bytes: &[u8]) -> Result<Loaded, Problem> {
 }
 
 /// The JSON and the binary chunk; the latter may be missing.
-fn chunks(bytes: &[u8]) -> Result<(&[u8], &[u8]), Problem> {
+fn chunks(bytes: &[u8]) -> Result<(&[u8], &[u8]), Invalid> {
     let mut cursor = Cursor { left: bytes };
     if cursor.u32("header")? != MAGIC {
-        return Err(Problem::new("header", "\"glTF\"", format!("{:?}", String::from_utf8_lossy(&bytes[..4]))));
+        return Err(problem("header", "\"glTF\"", format!("{:?}", String::from_utf8_lossy(&bytes[..4]))));
     }
     let version = cursor.u32("version")?;
     if version != 2 {
-        return Err(Problem::new("version", "2", version));
+        return Err(problem("version", "2", version));
     }
     let length = cursor.u32("length")?;
     if length as usize != bytes.len() {
-        return Err(Problem::new("length", format!("{} as the file", bytes.len()), length));
+        return Err(problem("length", format!("{} as the file", bytes.len()), length));
     }
     let (mut json, mut binary) = (None, None);
     while !cursor.left.is_empty() {
@@ -160,7 +161,7 @@ fn chunks(bytes: &[u8]) -> Result<(&[u8], &[u8]), Problem> {
             _ => {} // to be ignored, says the specification
         }
     }
-    let json = json.ok_or_else(|| Problem::new("chunks", "one of type JSON", "none"))?;
+    let json = json.ok_or_else(|| problem("chunks", "one of type JSON", "none"))?;
     Ok((json, binary.unwrap_or_default()))
 }
 
@@ -172,24 +173,20 @@ struct File<'a> {
 
 impl File<'_> {
     /// Calls `each` with every mesh in the scene and where it is placed.
-    fn placed(&self, mut each: impl FnMut(usize, Similarity) -> Result<(), Problem>) -> Result<(), Problem> {
+    fn placed(&self, mut each: impl FnMut(usize, Similarity) -> Result<(), Invalid>) -> Result<(), Invalid> {
         let scene = self.gltf.scene.unwrap_or(0);
         let Some(scene) = self.gltf.scenes.get(scene) else {
-            return Err(Problem::new(
-                "scene",
-                "the number of a scene",
-                format!("{scene} of {}", self.gltf.scenes.len()),
-            ));
+            return Err(problem("scene", "the number of a scene", format!("{scene} of {}", self.gltf.scenes.len())));
         };
         let origin = Similarity { scale: 1.0, rotation: DQuat::IDENTITY, translation: DVec3::ZERO };
         let mut seen = vec![false; self.gltf.nodes.len()];
         let mut next: Vec<_> = scene.nodes.iter().rev().map(|n| (*n, origin)).collect();
         while let Some((n, parent)) = next.pop() {
             let Some(node) = self.gltf.nodes.get(n) else {
-                return Err(Problem::new("node", format!("a number below {}", self.gltf.nodes.len()), n));
+                return Err(problem("node", format!("a number below {}", self.gltf.nodes.len()), n));
             };
             if std::mem::replace(&mut seen[n], true) {
-                return Err(Problem::new(format!("node {n}"), "one parent", "more, or a circle"));
+                return Err(problem(format!("node {n}"), "one parent", "more, or a circle"));
             }
             let own = node.similarity(n)?;
             let place = Similarity {
@@ -201,7 +198,7 @@ impl File<'_> {
                 Some(mesh) if mesh < self.gltf.meshes.len() => each(mesh, place)?,
                 Some(mesh) => {
                     let expected = format!("a number below {}", self.gltf.meshes.len());
-                    return Err(Problem::new(format!("node {n}, mesh"), expected, mesh));
+                    return Err(problem(format!("node {n}, mesh"), expected, mesh));
                 }
                 None => {}
             }
@@ -218,20 +215,20 @@ impl File<'_> {
         extension: &Value,
         place: Similarity,
         rows: &mut Vec<f32>,
-    ) -> Result<(), Problem> {
+    ) -> Result<(), Invalid> {
         if primitive.mode != Some(0) {
             let found = primitive.mode.map_or("none".into(), |m| m.to_string());
-            return Err(Problem::new(format!("{name}, mode"), "0 (points)", found));
+            return Err(problem(format!("{name}, mode"), "0 (points)", found));
         }
         let must = [("kernel", "ellipse"), ("colorSpace", "srgb_rec709_display")];
         for (field, expected) in must {
             let found = extension.get(field).unwrap_or(&Value::Null);
             if found != expected {
-                return Err(Problem::new(format!("{name}, {EXTENSION}, {field}"), expected, found));
+                return Err(problem(format!("{name}, {EXTENSION}, {field}"), expected, found));
             }
         }
         if let Some((other, _)) = extension.get("extensions").and_then(Value::as_object).and_then(|e| e.iter().next()) {
-            return Err(Problem::new(format!("{name}, {EXTENSION}, extensions"), "none", other));
+            return Err(problem(format!("{name}, {EXTENSION}, extensions"), "none", other));
         }
         let get = |attribute: &str, kind: &str| self.numbers(name, primitive, attribute, kind);
         let positions = get("POSITION", "VEC3")?;
@@ -243,7 +240,7 @@ impl File<'_> {
         let lengths = [("ROTATION", rotations.len() / 4), ("SCALE", scales.len() / 3), ("OPACITY", opacities.len())];
         for (attribute, found) in [&lengths[..], &[("SH_DEGREE_0_COEF_0", colors.len() / 3)]].concat() {
             if found != count {
-                return Err(Problem::new(format!("{name}, {attribute}, count"), count.to_string(), found));
+                return Err(problem(format!("{name}, {attribute}, count"), count.to_string(), found));
             }
         }
         // Nodes may show one mesh many times.
@@ -251,7 +248,7 @@ impl File<'_> {
         check_expansion("count of Gaussians", total as u64, 4 * channel::COUNT, self.size)?;
         for i in 0..count {
             let bad = |attribute: &str, expected: &str, found: f32| {
-                Err(Problem::new(format!("{name}, {attribute}, element {i}"), expected, found))
+                Err(problem(format!("{name}, {attribute}, element {i}"), expected, found))
             };
             let vector = |values: &[f32]| DVec3::from_array([0, 1, 2].map(|k| f64::from(values[3 * i + k])));
             let mut row = Row::default();
@@ -277,10 +274,9 @@ impl File<'_> {
     }
 
     /// All numbers of an attribute, one element after the other.
-    fn numbers(&self, name: &str, primitive: &Primitive, attribute: &str, kind: &str) -> Result<Vec<f32>, Problem> {
-        let problem = |expected: &str, found: &dyn std::fmt::Display| {
-            Problem::new(format!("{name}, {attribute}"), expected, found)
-        };
+    fn numbers(&self, name: &str, primitive: &Primitive, attribute: &str, kind: &str) -> Result<Vec<f32>, Invalid> {
+        let problem =
+            |expected: &str, found: &dyn std::fmt::Display| problem(format!("{name}, {attribute}"), expected, found);
         let Some(number) = primitive.attributes.get(attribute) else { return Err(problem("it", &"no such attribute")) };
         let accessor = self.gltf.accessors.get(*number).ok_or_else(|| problem("the number of an accessor", number))?;
         if accessor.r#type != kind {
@@ -350,7 +346,7 @@ impl File<'_> {
 }
 
 impl Node {
-    fn similarity(&self, n: usize) -> Result<Similarity, Problem> {
+    fn similarity(&self, n: usize) -> Result<Similarity, Invalid> {
         let (axes, translation) = match self.matrix {
             Some(m) => {
                 let m = DMat4::from_cols_array(&m);
@@ -359,7 +355,7 @@ impl Node {
             None => {
                 let q = DQuat::from_array(self.rotation.unwrap_or([0.0, 0.0, 0.0, 1.0]));
                 if !q.length_recip().is_normal() {
-                    return Err(Problem::new(format!("node {n}, rotation"), "a quaternion of unit length", q));
+                    return Err(problem(format!("node {n}, rotation"), "a quaternion of unit length", q));
                 }
                 let scale = DMat3::from_diagonal(self.scale.unwrap_or([1.0; 3]).into());
                 (DMat3::from_quat(q.normalize()) * scale, self.translation.unwrap_or_default().into())
@@ -372,7 +368,7 @@ impl Node {
         if !(scale > 0.0 && defect.iter().all(|d| d.abs() < 1e-4) && translation.is_finite()) {
             let expected = "rotation, translation and the same positive scale along all axes, since Gaussians have \
                             perpendicular axes";
-            return Err(Problem::new(format!("node {n}"), expected, "another transform"));
+            return Err(problem(format!("node {n}"), expected, "another transform"));
         }
         Ok(Similarity { scale, rotation: DQuat::from_mat3(&rotation).normalize(), translation })
     }

@@ -29,7 +29,7 @@ pub mod viewer;
 
 use std::{fmt, fs::File, io::Read, io::Write, path::Path};
 
-use freerange_core::write_atomically;
+use freerange_core::{Invalid, IoError, write_atomically};
 use freerange_splat::{Cloud, SplatError, encode_ply, parse_ply};
 use glam::DVec3;
 
@@ -37,7 +37,7 @@ pub use error::FormatError;
 pub use frame::Frame;
 pub use spz::SpzVersion;
 
-use error::Problem;
+use error::problem;
 
 /// The kinds of file that Gaussians are kept in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -146,9 +146,8 @@ pub struct Encoded {
 /// file does not hold what its extension says.
 pub fn read(path: &Path, frame: Frame) -> Result<Loaded, FormatError> {
     let format = Format::of(path)?;
-    let at = |source| FormatError::Io { file: path.into(), source };
     let mut bytes = Vec::new();
-    File::open(path).and_then(|mut f| f.read_to_end(&mut bytes)).map_err(at)?;
+    File::open(path).and_then(|mut f| f.read_to_end(&mut bytes)).map_err(IoError::at(path))?;
     parse(format, &bytes, path, frame)
 }
 
@@ -168,7 +167,7 @@ pub fn parse(format: Format, bytes: &[u8], name: &Path, frame: Frame) -> Result<
         Format::Glb => glb_read::decode(bytes),
         Format::Html => html::decode(bytes),
     };
-    let mut loaded = parsed.and_then(checked).map_err(|p: Problem| p.within(name))?;
+    let mut loaded = parsed.and_then(checked).map_err(|problem| FormatError::Invalid { file: name.into(), problem })?;
     if let Some(fixed) = format.fixed_frame() {
         turn(&mut loaded.cloud, fixed, frame);
     }
@@ -183,7 +182,7 @@ pub fn parse(format: Format, bytes: &[u8], name: &Path, frame: Frame) -> Result<
 pub fn write(cloud: &Cloud, path: &Path, options: &WriteOptions) -> Result<Vec<String>, FormatError> {
     let encoded = encode(cloud, Format::of(path)?, options)?;
     let written = write_atomically(path, |w| w.write_all(&encoded.bytes));
-    written.map_err(|source| FormatError::Io { file: path.into(), source })?;
+    written.map_err(IoError::at(path))?;
     Ok(encoded.notes)
 }
 
@@ -225,10 +224,10 @@ fn turn(cloud: &mut Cloud, from: Frame, to: Frame) {
 }
 
 /// Refuses Gaussians that are not finite.
-fn checked(loaded: Loaded) -> Result<Loaded, Problem> {
+fn checked(loaded: Loaded) -> Result<Loaded, Invalid> {
     match loaded.cloud.check_finite() {
         Err(SplatError::Value { row, name, found, .. }) => {
-            Err(Problem::new(format!("Gaussian {row}, {name}"), "a finite number", found))
+            Err(problem(format!("Gaussian {row}, {name}"), "a finite number", found))
         }
         _ => Ok(loaded),
     }

@@ -3,11 +3,12 @@
 //! Position `f32 x 3`, standard deviations `f32 x 3`, colour and opacity `u8 x 4`, rotation `w x y z` as `u8 x 4`
 //! around 128. The layout is that of the viewer by Kwok (github.com/antimatter15/splat), which has no other document.
 
+use freerange_core::Invalid;
 use freerange_splat::{Cloud, channel};
 
 use crate::{
     Encoded, Loaded,
-    error::Problem,
+    error::problem,
     quantize::{Row, byte, log_scale, logit_of_byte, set_rotation, unorm8},
 };
 
@@ -35,10 +36,10 @@ pub fn encode(cloud: &Cloud) -> Encoded {
     Encoded { bytes, notes: clip_note(clipped, "colours beyond 0..1") }
 }
 
-pub fn decode(bytes: &[u8]) -> Result<Loaded, Problem> {
+pub fn decode(bytes: &[u8]) -> Result<Loaded, Invalid> {
     let (rows, rest) = bytes.as_chunks::<BYTES>();
     if !rest.is_empty() {
-        return Err(Problem::new("length", "a multiple of 32 bytes", bytes.len()));
+        return Err(problem("length", "a multiple of 32 bytes", bytes.len()));
     }
     let mut cloud = Vec::with_capacity(rows.len() * channel::COUNT);
     for (i, record) in rows.iter().enumerate() {
@@ -49,7 +50,7 @@ pub fn decode(bytes: &[u8]) -> Result<Loaded, Problem> {
             row[k] = float(k);
             let scale = f64::from(float(3 + k));
             if !(scale >= 0.0 && scale.is_finite()) {
-                return Err(Problem::new(format!("Gaussian {i}, scale {k}"), "a number, at least 0", scale));
+                return Err(problem(format!("Gaussian {i}, scale {k}"), "a number, at least 0", scale));
             }
             row[channel::LOG_SCALE.start + k] = log_scale(scale);
             row[channel::COLOR.start + k] = (f64::from(small[k]) / 255.0) as f32;

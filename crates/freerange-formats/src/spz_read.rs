@@ -3,13 +3,14 @@
 use std::io::Read;
 
 use flate2::bufread::GzDecoder;
+use freerange_core::Invalid;
 use freerange_splat::{Cloud, channel};
 use ruzstd::decoding::StreamingDecoder;
 
 use crate::{
     Loaded,
     bytes::{Cursor, check_expansion},
-    error::Problem,
+    error::problem,
     quantize::{Row, color_of_sh, from_smallest_three, logit_of_byte, set_rotation},
     spz::{COLOR_SCALE, HEADER_4, MAGIC},
 };
@@ -31,10 +32,10 @@ struct Header {
 
 impl Header {
     /// After the magic number: 12 bytes, of which the last means something in version 4 only.
-    fn read(cursor: &mut Cursor, file: usize) -> Result<(Self, u8), Problem> {
+    fn read(cursor: &mut Cursor, file: usize) -> Result<(Self, u8), Invalid> {
         let version = cursor.u32("version")?;
         if !(2..=4).contains(&version) {
-            return Err(Problem::new("version", "2, 3 or 4", version));
+            return Err(problem("version", "2, 3 or 4", version));
         }
         let count = cursor.u32("count of Gaussians")?;
         let degree = cursor.u8("degree of spherical harmonics")?;
@@ -42,10 +43,10 @@ impl Header {
         let flags = cursor.u8("flags")?;
         let last = cursor.u8("header")?;
         if degree > 4 {
-            return Err(Problem::new("degree of spherical harmonics", "at most 4", degree));
+            return Err(problem("degree of spherical harmonics", "at most 4", degree));
         }
         if bits > 30 {
-            return Err(Problem::new("fractional bits", "at most 30", bits));
+            return Err(problem("fractional bits", "at most 30", bits));
         }
         let count = check_expansion("count of Gaussians", count.into(), BYTES, file)?;
         let degree = usize::from(degree);
@@ -62,7 +63,7 @@ impl Header {
     }
 }
 
-pub fn decode(bytes: &[u8]) -> Result<Loaded, Problem> {
+pub fn decode(bytes: &[u8]) -> Result<Loaded, Invalid> {
     let (header, streams) = match bytes {
         [0x1f, 0x8b, ..] => legacy(bytes)?,
         _ => streamed(bytes)?,
@@ -71,20 +72,20 @@ pub fn decode(bytes: &[u8]) -> Result<Loaded, Problem> {
 }
 
 /// Versions 2 and 3: all in one gzip stream.
-fn legacy(bytes: &[u8]) -> Result<(Header, [Vec<u8>; 5]), Problem> {
+fn legacy(bytes: &[u8]) -> Result<(Header, [Vec<u8>; 5]), Invalid> {
     let mut stream = GzDecoder::new(bytes);
     let start = up_to(&mut stream, 16, "gzip stream")?;
     let mut cursor = Cursor { left: &start };
     magic(&mut cursor)?;
     let (header, _) = Header::read(&mut cursor, bytes.len())?;
     if header.version == 4 {
-        return Err(Problem::new("version", "2 or 3 within a gzip stream", 4));
+        return Err(problem("version", "2 or 3 within a gzip stream", 4));
     }
     let mut streams: [Vec<u8>; 5] = Default::default();
     for (stream_out, (length, name)) in streams.iter_mut().zip(header.lengths().into_iter().zip(NAMES)) {
         *stream_out = up_to(&mut stream, length, name)?;
         if stream_out.len() < length {
-            return Err(Problem::new(name, format!("{length} bytes"), format!("{} and the end", stream_out.len())));
+            return Err(problem(name, format!("{length} bytes"), format!("{} and the end", stream_out.len())));
         }
     }
     Ok((header, streams))
@@ -93,20 +94,20 @@ fn legacy(bytes: &[u8]) -> Result<(Header, [Vec<u8>; 5]), Problem> {
 const NAMES: [&str; 5] = ["positions", "opacities", "colours", "scales", "rotations"];
 
 /// Version 4: a ZSTD stream each, after a table of their sizes.
-fn streamed(bytes: &[u8]) -> Result<(Header, [Vec<u8>; 5]), Problem> {
+fn streamed(bytes: &[u8]) -> Result<(Header, [Vec<u8>; 5]), Invalid> {
     let mut cursor = Cursor { left: bytes };
     magic(&mut cursor)?;
     let (header, count) = Header::read(&mut cursor, bytes.len())?;
     if header.version != 4 {
-        return Err(Problem::new("version", "4 outside of a gzip stream", header.version));
+        return Err(problem("version", "4 outside of a gzip stream", header.version));
     }
     let streams_expected = if header.harmonics > 0 { 6 } else { 5 };
     if count != streams_expected && header.count > 0 {
-        return Err(Problem::new("count of streams", streams_expected.to_string(), count));
+        return Err(problem("count of streams", streams_expected.to_string(), count));
     }
     let table = cursor.u32("place of the table")?;
     let table = usize::try_from(table).ok().filter(|t| *t >= HEADER_4).and_then(|t| bytes.get(t..));
-    let Some(left) = table else { return Err(Problem::new("place of the table", "one within the file", "another")) };
+    let Some(left) = table else { return Err(problem("place of the table", "one within the file", "another")) };
     let mut table = Cursor { left };
     let mut sizes = [[0u64; 2]; 6];
     for size in &mut sizes[..usize::from(count).min(6)] {
@@ -116,40 +117,38 @@ fn streamed(bytes: &[u8]) -> Result<(Header, [Vec<u8>; 5]), Problem> {
     for (k, length) in header.lengths().into_iter().enumerate() {
         let [packed, claimed] = sizes[k];
         if claimed != length as u64 {
-            return Err(Problem::new(format!("table, size of the {}", NAMES[k]), length.to_string(), claimed));
+            return Err(problem(format!("table, size of the {}", NAMES[k]), length.to_string(), claimed));
         }
         let packed = table.take(NAMES[k], usize::try_from(packed).unwrap_or(usize::MAX))?;
         if length == 0 {
             continue;
         }
-        let broken = |e: &dyn std::fmt::Display| Problem::new(NAMES[k], "a ZSTD stream", e);
+        let broken = |e: &dyn std::fmt::Display| problem(NAMES[k], "a ZSTD stream", e);
         let mut decoder = StreamingDecoder::new(packed).map_err(|e| broken(&e))?;
         streams[k] = up_to(&mut decoder, length, NAMES[k])?;
         if streams[k].len() < length {
-            return Err(Problem::new(NAMES[k], format!("{length} bytes"), format!("{} and the end", streams[k].len())));
+            return Err(problem(NAMES[k], format!("{length} bytes"), format!("{} and the end", streams[k].len())));
         }
     }
     Ok((header, streams))
 }
 
-fn magic(cursor: &mut Cursor) -> Result<(), Problem> {
+fn magic(cursor: &mut Cursor) -> Result<(), Invalid> {
     match cursor.u32("header")? {
         MAGIC => Ok(()),
-        other => {
-            Err(Problem::new("header", "\"NGSP\"", format!("{:?}", String::from_utf8_lossy(&other.to_le_bytes()))))
-        }
+        other => Err(problem("header", "\"NGSP\"", format!("{:?}", String::from_utf8_lossy(&other.to_le_bytes())))),
     }
 }
 
 /// At most `count` bytes, fewer where the stream ends; memory grows with what arrives.
-fn up_to(stream: &mut impl Read, count: usize, field: &str) -> Result<Vec<u8>, Problem> {
+fn up_to(stream: &mut impl Read, count: usize, field: &str) -> Result<Vec<u8>, Invalid> {
     let mut bytes = Vec::new();
     let read = stream.take(count as u64).read_to_end(&mut bytes);
-    read.map_err(|e| Problem::new(field, "a compressed stream", e))?;
+    read.map_err(|e| problem(field, "a compressed stream", e))?;
     Ok(bytes)
 }
 
-fn unpack(header: &Header, [positions, opacities, colors, scales, rotations]: [&[u8]; 5]) -> Result<Loaded, Problem> {
+fn unpack(header: &Header, [positions, opacities, colors, scales, rotations]: [&[u8]; 5]) -> Result<Loaded, Invalid> {
     let unit = 0.5f64.powi(header.bits.into());
     let mut rows = Vec::with_capacity(header.count * channel::COUNT);
     for i in 0..header.count {

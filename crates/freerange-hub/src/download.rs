@@ -6,7 +6,7 @@ use std::{
     time::Duration,
 };
 
-use freerange_core::hex;
+use freerange_core::{IoError, beside, hex, persist};
 use serde::Deserialize;
 use sha2::{Digest, Sha256};
 use tempfile::NamedTempFile;
@@ -80,8 +80,7 @@ impl Hub {
                 return Err(HubError::Checksum { url, expected, found });
             }
             let target = folder.join(file);
-            let kept = temporary.as_file().sync_all().and_then(|()| Ok(temporary.persist(&target)?));
-            kept.map_err(|source| HubError::Io { path: target, source })?;
+            persist(temporary, &target).map_err(IoError::at(&target))?;
             pins.sha256.insert((*file).into(), found);
             let text = serde_json::to_vec_pretty(pins).expect("strings");
             write(&folder.join("pins.json"), &text)?;
@@ -115,9 +114,8 @@ fn fetch(
     if size > FILE_LIMIT {
         return Err(failed(url, format!("expected at most {FILE_LIMIT} bytes, found {size}")));
     }
-    let io = |source| HubError::Io { path: folder.into(), source };
-    std::fs::create_dir_all(folder).map_err(io)?;
-    let mut file = NamedTempFile::new_in(folder).map_err(io)?;
+    std::fs::create_dir_all(folder).map_err(IoError::at(folder))?;
+    let mut file = beside(&folder.join(name)).map_err(IoError::at(folder))?;
     let mut body = agent.get(url).call().map_err(|e| failed(url, e))?.into_body().into_reader();
     let (mut hash, mut done, mut buffer) = (Sha256::new(), 0, vec![0; 1 << 18]);
     loop {
@@ -127,7 +125,7 @@ fn fetch(
             break;
         }
         hash.update(&buffer[..n]);
-        file.write_all(&buffer[..n]).map_err(io)?;
+        file.write_all(&buffer[..n]).map_err(IoError::at(folder))?;
         progress(name, done, size);
     }
     match done == size {

@@ -1,6 +1,8 @@
 //! What can go wrong in this crate.
 
-use std::{io, path::PathBuf};
+use std::path::PathBuf;
+
+use freerange_core::IoError;
 
 /// Errors of this crate.
 #[derive(Debug, thiserror::Error)]
@@ -50,11 +52,6 @@ pub enum HubError {
         found: String,
     },
     /// The operating system refused to read or write a file.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: io::Error,
-    },
+    #[error(transparent)]
+    Io(#[from] IoError),
 }

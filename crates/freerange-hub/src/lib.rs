@@ -19,7 +19,7 @@ use std::{
     str::FromStr,
 };
 
-use freerange_core::sha256_of;
+use freerange_core::{IoError, sha256_of};
 use serde::{Deserialize, Serialize};
 
 pub use error::HubError;
@@ -157,7 +157,7 @@ fn read_reference(path: &Path) -> Result<Option<String>, HubError> {
             Err(HubError::Cache { path: path.into(), expected: "a commit of 40 hexadecimal digits".into(), found })
         }
         Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(None),
-        Err(source) => Err(HubError::Io { path: path.into(), source }),
+        Err(e) => Err(IoError::at(path)(e).into()),
     }
 }
 
@@ -170,7 +170,7 @@ fn read_pins(folder: &Path) -> Result<Pins, HubError> {
             found: e.to_string(),
         }),
         Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(Pins::default()),
-        Err(source) => Err(HubError::Io { path, source }),
+        Err(e) => Err(IoError::at(&path)(e).into()),
     }
 }
 
@@ -180,7 +180,7 @@ fn is_whole(path: &Path, pinned: Option<&String>) -> Result<bool, HubError> {
     match File::open(path).and_then(|mut file| sha256_of(&mut file)) {
         Ok(found) => Ok(found == *pinned),
         Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(false),
-        Err(source) => Err(HubError::Io { path: path.into(), source }),
+        Err(e) => Err(IoError::at(path)(e).into()),
     }
 }
 
@@ -189,7 +189,7 @@ fn write(path: &Path, bytes: &[u8]) -> Result<(), HubError> {
     let folder = path.parent().unwrap_or(Path::new("."));
     let written = std::fs::create_dir_all(folder)
         .and_then(|()| freerange_core::write_atomically(path, |file| file.write_all(bytes)));
-    written.map_err(|source| HubError::Io { path: path.into(), source })
+    Ok(written.map_err(IoError::at(path))?)
 }
 
 #[cfg(test)]

@@ -11,7 +11,7 @@ use std::{
 };
 
 use burn::tensor::{Device, f16};
-use freerange_core::write_atomically;
+use freerange_core::{IoError, write_atomically};
 use freerange_splat::{Normalization, channel};
 use safetensors::{Dtype, tensor::TensorView};
 
@@ -98,7 +98,7 @@ impl Checkpoint {
             .map_err(|e| ModelError::format(path, KIND, e))?;
         let bytes =
             safetensors::serialize(views, Some(self.metadata(path)?)).map_err(|e| ModelError::format(path, KIND, e))?;
-        write_atomically(path, |file| file.write_all(&bytes)).map_err(|e| ModelError::io(path, e))
+        Ok(write_atomically(path, |file| file.write_all(&bytes)).map_err(IoError::at(path))?)
     }
 
     fn metadata(&self, path: &Path) -> Result<HashMap<String, String>, ModelError> {

@@ -391,7 +391,7 @@ mod tests {
         ];
         for (name, config) in cases {
             let message = config.validate().unwrap_err().to_string();
-            assert!(message.contains(&format!("`{name}`")), "{message}");
+            assert!(message.contains(&format!(" {name}: expected")), "{message}");
         }
     }
 }

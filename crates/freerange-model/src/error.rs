@@ -2,27 +2,17 @@
 
 use std::path::PathBuf;
 
+use freerange_core::{Invalid, IoError};
+
 /// What can go wrong with a model that came from outside: its configuration or its files.
 #[derive(Debug, thiserror::Error)]
 pub enum ModelError {
     /// A configuration value that makes no sense.
-    #[error("model configuration: `{field}` is {found}, expected {expected}")]
-    Config {
-        /// The field, with its path.
-        field: &'static str,
-        /// What it has to be.
-        expected: String,
-        /// What it is.
-        found: String,
-    },
+    #[error("model configuration: {0}")]
+    Config(#[from] Invalid),
     /// The operating system refused to read or write.
-    #[error("{path}: {source}")]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    Io(#[from] IoError),
     /// The file is no valid file of its kind.
     #[error("{path}: not a valid {kind}: {reason}")]
     Format {
@@ -79,15 +69,11 @@ pub enum ModelError {
 }
 
 impl ModelError {
-    pub(crate) fn config(field: &'static str, expected: impl Into<String>, found: impl ToString) -> Self {
-        Self::Config { field, expected: expected.into(), found: found.to_string() }
+    pub(crate) fn config(field: &str, expected: impl Into<String>, found: impl ToString) -> Self {
+        Self::Config(Invalid::new(field, expected, found))
     }
 
     pub(crate) fn format(path: &std::path::Path, kind: &'static str, reason: impl ToString) -> Self {
         Self::Format { path: path.to_owned(), kind, reason: reason.to_string() }
-    }
-
-    pub(crate) fn io(path: &std::path::Path, source: std::io::Error) -> Self {
-        Self::Io { path: path.to_owned(), source }
     }
 }

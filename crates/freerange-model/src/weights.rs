@@ -6,6 +6,7 @@ use std::{
 };
 
 use burn::tensor::{bf16, f16};
+use freerange_core::IoError;
 use safetensors::{Dtype, SafeTensors};
 
 use crate::{
@@ -15,11 +16,11 @@ use crate::{
 
 /// Reads a whole regular file: memory is bounded by its size on disk.
 pub(crate) fn read_bounded(path: &Path) -> Result<Vec<u8>, ModelError> {
-    let metadata = std::fs::metadata(path).map_err(|e| ModelError::io(path, e))?;
+    let metadata = std::fs::metadata(path).map_err(IoError::at(path))?;
     if !metadata.is_file() {
         return Err(ModelError::format(path, "file", "it is a folder or a device"));
     }
-    std::fs::read(path).map_err(|e| ModelError::io(path, e))
+    Ok(std::fs::read(path).map_err(IoError::at(path))?)
 }
 
 /// The tensors of a file. As a [`Source`] it gives out values only where name, shape and type fit.

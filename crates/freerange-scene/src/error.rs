@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use freerange_core::{Invalid, IoError};
+
 /// Why photos cannot be used.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -10,21 +12,11 @@ pub enum SceneError {
     #[error(transparent)]
     Camera(#[from] freerange_camera::CameraError),
     /// A file or folder cannot be read.
-    #[error("cannot read {}", file.display())]
-    Read {
-        /// The file.
-        file: PathBuf,
-        /// The system's reason.
-        source: std::io::Error,
-    },
+    #[error("cannot read {0}")]
+    Read(#[source] IoError),
     /// A file or folder cannot be written.
-    #[error("cannot write {}", file.display())]
-    Write {
-        /// The file.
-        file: PathBuf,
-        /// The system's reason.
-        source: std::io::Error,
-    },
+    #[error("cannot write {0}")]
+    Write(#[source] IoError),
     /// A file is larger than any real one.
     #[error("{}: expected at most {limit} bytes, found {found}", file.display())]
     TooLarge {
@@ -154,15 +146,8 @@ pub enum SceneError {
         reason: String,
     },
     /// An option cannot be used.
-    #[error("{option}: expected {expected}, found {found}")]
-    Option {
-        /// Its name.
-        option: &'static str,
-        /// What would be accepted.
-        expected: String,
-        /// What was given.
-        found: String,
-    },
+    #[error(transparent)]
+    Option(#[from] Invalid),
 }
 
 fn at(place: &str) -> String {
@@ -194,6 +179,6 @@ impl In<'_> {
     }
 
     pub fn read(self, source: std::io::Error) -> SceneError {
-        SceneError::Read { file: self.0.into(), source }
+        SceneError::Read(IoError::at(self.0)(source))
     }
 }

@@ -7,6 +7,7 @@ use crate::{
     read::{Cameras, Format, IMAGES, LARGEST_SIDE, Photo, inside},
 };
 use freerange_camera::{Camera, Lens, Up, View, image_ops::resize_area, scene::cut_out};
+use freerange_core::{Invalid, IoError, beside, persist};
 use image::{DynamicImage, GrayImage, ImageDecoder, ImageReader, Luma, Rgba, RgbaImage, metadata::Orientation};
 use rayon::prelude::*;
 use std::{
@@ -157,18 +158,16 @@ pub fn load(cameras: &Cameras, config: &LoadConfig) -> Result<Loaded, SceneError
         return Err(SceneError::TooFew { file, expected: 2, found: inputs.len() });
     }
     let masks = mask_files(&cameras.photos, &inputs, config)?;
-    let pictures: Vec<Picture> = inputs
-        .par_iter()
-        .zip(&masks)
-        .map(|(i, mask)| picture(&cameras.photos[*i], mask.as_deref(), config))
-        .collect::<Result<_, _>>()?;
+    let pictures: Vec<Picture> = first_error(
+        inputs.par_iter().zip(&masks).map(|(i, mask)| picture(&cameras.photos[*i], mask.as_deref(), config)).collect(),
+    )?;
     let mut notes = Vec::new();
     tell(&pictures, cameras, &inputs, &mut notes);
     let pixels: u64 = pictures.iter().map(|p| u64::from(p.image.width()) * u64::from(p.image.height())).sum();
     if pixels > LARGEST_SCENE {
         let expected =
             format!("photos of at most {LARGEST_SCENE} pixels together; fewer of them, or a smaller --max-side");
-        return Err(SceneError::Option { option: "--max-side", expected, found: pixels.to_string() });
+        return Err(Invalid::new("--max-side", expected, pixels).into());
     }
     let mut names = vec![String::new(); cameras.photos.len()];
     for group in [&inputs, &further] {
@@ -189,22 +188,25 @@ pub fn load(cameras: &Cameras, config: &LoadConfig) -> Result<Loaded, SceneError
     }
     let told: Vec<Told<'_>> = pictures.iter().map(|p| Told { mask: p.mask.as_ref(), alpha: p.alpha }).collect();
     let (kind, estimate) = cut_all(&mut views, &told, config, &mut notes)?;
-    let further = further
-        .par_iter()
-        .map(|i| {
-            let photo = &cameras.photos[*i];
-            let mask = photo.mask.as_deref();
-            let p = picture(photo, mask, config)?;
-            let mut view = View { name: names[*i].clone(), camera: p.camera, image: p.image };
-            if let Some(mask) = &p.mask {
-                set_alpha(&mut view.image, mask.as_raw());
-            } else if opaque(&view.image) {
-                view.image = plain(&view)?;
-            }
-            Ok(view)
-        })
-        .collect::<Result<_, SceneError>>()?;
+    let further = further.par_iter().map(|i| {
+        let photo = &cameras.photos[*i];
+        let mask = photo.mask.as_deref();
+        let p = picture(photo, mask, config)?;
+        let mut view = View { name: names[*i].clone(), camera: p.camera, image: p.image };
+        if let Some(mask) = &p.mask {
+            set_alpha(&mut view.image, mask.as_raw());
+        } else if opaque(&view.image) {
+            view.image = plain(&view)?;
+        }
+        Ok(view)
+    });
+    let further = first_error(further.collect())?;
     Ok(Loaded { views, photos: inputs, whole, further, masks: kind, estimate, notes })
+}
+
+/// What is wrong with the first photo that has anything: Rayon would tell of the one that was looked at first.
+fn first_error<T>(results: Vec<Result<T, SceneError>>) -> Result<Vec<T>, SceneError> {
+    results.into_iter().collect()
 }
 
 /// The files that [`load`] reads: of cameras, photos and masks; each once, sorted. None of them is opened.
@@ -347,7 +349,7 @@ fn network(model: &MaskModel, views: &[View]) -> Result<Vec<Vec<u8>>, SceneError
 #[cfg(not(feature = "mask-model"))]
 fn network(model: &MaskModel, _: &[View]) -> Result<Vec<Vec<u8>>, SceneError> {
     let expected = format!("a program built with --features mask-model, to run {}", model.file.display());
-    Err(SceneError::Option { option: "--mask-model", expected, found: "one without".into() })
+    Err(Invalid::new("--mask-model", expected, "one without").into())
 }
 
 fn set_alpha(image: &mut RgbaImage, alpha: &[u8]) {
@@ -561,13 +563,13 @@ pub fn write_masks(folder: &Path, cameras: &Cameras, loaded: &Loaded) -> Result<
             None => format!("{}.png", photo.image.file_name().unwrap_or_default().to_string_lossy()),
         };
         let path = inside(folder, &name).unwrap_or_else(|| folder.join(format!("{}.png", view.name)));
-        let failed = |source| SceneError::Write { file: path.clone(), source };
-        let parent = path.parent().unwrap_or(folder);
-        std::fs::create_dir_all(parent).map_err(failed)?;
-        let temporary = tempfile::NamedTempFile::new_in(parent).map_err(failed)?;
-        mask.write_to(&mut std::io::BufWriter::new(&temporary), image::ImageFormat::Png)
-            .map_err(|e| failed(std::io::Error::other(e)))?;
-        temporary.persist(&path).map_err(|e| failed(e.error))?;
+        let done = std::fs::create_dir_all(path.parent().unwrap_or(folder)).and_then(|()| {
+            let temporary = beside(&path)?;
+            mask.write_to(&mut std::io::BufWriter::new(&temporary), image::ImageFormat::Png)
+                .map_err(std::io::Error::other)?;
+            persist(temporary, &path)
+        });
+        done.map_err(|e| SceneError::Write(IoError::at(&path)(e)))?;
         written.push(path);
     }
     Ok(written)

@@ -1,5 +1,7 @@
 use std::{net::IpAddr, path::PathBuf, time::Duration};
 
+use freerange_core::Invalid;
+
 use crate::ServeError;
 
 /// How a server is set up.
@@ -104,7 +106,7 @@ impl ServeConfig {
     /// # Errors
     /// Names the option.
     pub fn check(&self) -> Result<(), ServeError> {
-        let refuse = |option, expected: String, found: String| Err(ServeError::Option { option, expected, found });
+        let refuse = |option: &str, expected: String, found: String| Err(Invalid::new(option, expected, found).into());
         match &self.token {
             None if !self.host.is_loopback() => refuse(
                 "--token",

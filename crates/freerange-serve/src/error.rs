@@ -1,19 +1,12 @@
-use std::path::PathBuf;
+use freerange_core::{Invalid, IoError};
 
 /// Why a server cannot be.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ServeError {
     /// An option cannot be used.
-    #[error("{option}: expected {expected}, found {found}")]
-    Option {
-        /// Its name.
-        option: &'static str,
-        /// What would be accepted.
-        expected: String,
-        /// What was given.
-        found: String,
-    },
+    #[error(transparent)]
+    Option(#[from] Invalid),
     /// The address cannot be listened at.
     #[error("cannot listen at {address}: {source}")]
     Listen {
@@ -23,13 +16,8 @@ pub enum ServeError {
         source: std::io::Error,
     },
     /// The folder of jobs cannot be used.
-    #[error("{}: {source}", path.display())]
-    Folder {
-        /// The folder, or a file in it.
-        path: PathBuf,
-        /// The reason.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    Folder(#[from] IoError),
 }
 
 /// Why a request is not done: a status of HTTP, and a sentence for who asked.

@@ -1,18 +1,15 @@
 //! What can go wrong in this crate.
 
-use std::{io, path::PathBuf};
+use std::path::PathBuf;
+
+use freerange_core::IoError;
 
 /// Errors of this crate. Rows and lines are counted from zero and one, respectively.
 #[derive(Debug, thiserror::Error)]
 pub enum SplatError {
     /// The operating system refused to read or write a file.
-    #[error("{}: {source}", file.display())]
-    Io {
-        /// The file.
-        file: PathBuf,
-        /// Why.
-        source: io::Error,
-    },
+    #[error(transparent)]
+    Io(#[from] IoError),
     /// The header of a `.ply` cannot be understood.
     #[error("{}: header line {line}: expected {expected}, found {found}", file.display())]
     PlyHeader {

@@ -9,7 +9,7 @@ use crate::cloud::Row;
 use crate::ply_compressed;
 use crate::ply_header::{Element, Format, Header, Kind, Property, Scalar, read_header};
 use crate::{Cloud, SplatError, channel};
-use freerange_core::write_atomically;
+use freerange_core::{IoError, write_atomically};
 use std::io::{self, BufRead, BufReader, Read, Write};
 use std::{fs::File, path::Path};
 
@@ -58,7 +58,7 @@ pub struct PlyFile {
 /// [`SplatError::Io`]; [`SplatError::PlyHeader`], [`SplatError::PlyProperty`] and [`SplatError::PlyValue`] where the
 /// file is no `.ply`, does not hold Gaussians, ends early, or holds a value that is not finite.
 pub fn read_ply(file: &Path) -> Result<PlyFile, SplatError> {
-    let opened = File::open(file).map_err(|source| SplatError::Io { file: file.into(), source })?;
+    let opened = File::open(file).map_err(IoError::at(file))?;
     parse_ply(BufReader::with_capacity(1 << 18, opened), file)
 }
 
@@ -115,7 +115,7 @@ pub fn parse_ply(mut reader: impl BufRead, file: &Path) -> Result<PlyFile, Splat
 /// [`SplatError::Io`]; [`SplatError::Value`] where a channel is not finite.
 pub fn write_ply(cloud: &Cloud, file: &Path) -> Result<(), SplatError> {
     cloud.check_finite()?;
-    write_atomically(file, |w| write_to(cloud, w)).map_err(|source| SplatError::Io { file: file.into(), source })
+    Ok(write_atomically(file, |w| write_to(cloud, w)).map_err(IoError::at(file))?)
 }
 
 /// The bytes that [`write_ply`] writes.
@@ -257,7 +257,7 @@ impl<R: BufRead> Values<'_, R> {
                     let expected = format!("{} rows", element.count);
                     value_error(self.file, element, row, &property.name, &expected, "the end of the file")
                 }
-                _ => SplatError::Io { file: self.file.into(), source },
+                _ => IoError::at(self.file)(source).into(),
             });
         }
         if self.format == Format::Big {
@@ -286,7 +286,7 @@ impl<R: BufRead> Values<'_, R> {
             self.used = 0;
             self.line.clear();
             let read = self.reader.by_ref().take(LINE_LIMIT).read_until(b'\n', &mut self.line);
-            let read = read.map_err(|source| SplatError::Io { file: self.file.into(), source })?;
+            let read = read.map_err(IoError::at(self.file))?;
             let fail = |expected: &str, found| {
                 Err(value_error(self.file, element, row, &element.properties[0].name, expected, found))
             };

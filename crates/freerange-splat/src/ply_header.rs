@@ -1,5 +1,7 @@
 //! The header of a `.ply`: text that names elements, and their properties in order.
 
+use freerange_core::IoError;
+
 use crate::SplatError;
 use std::{io::BufRead, path::Path};
 
@@ -167,7 +169,7 @@ impl<R: BufRead> Lines<'_, R> {
         let limit = LINE_LIMIT.min(HEADER_LIMIT - self.total);
         let mut bytes = Vec::new();
         let read = std::io::Read::take(&mut *self.reader, limit).read_until(b'\n', &mut bytes);
-        self.total += read.map_err(|source| SplatError::Io { file: self.file.into(), source })? as u64;
+        self.total += read.map_err(IoError::at(self.file))? as u64;
         if bytes.pop() != Some(b'\n') {
             let found =
                 if bytes.len() as u64 + 1 >= limit { "a line or header too long" } else { "the end of the file" };

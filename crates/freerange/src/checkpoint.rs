@@ -6,9 +6,9 @@ use std::{
 };
 
 use burn::tensor::Device;
+use freerange_core::{IoError, sha256};
 use freerange_flow::trainer::EncoderWeights;
 use freerange_model::{Checkpoint, Dinov2, EncoderConfig, Header};
-use sha2::{Digest, Sha256};
 
 use crate::{Error, machine::weights_folder};
 
@@ -19,12 +19,11 @@ fn read(path: Option<&Path>) -> Result<(Cow<'static, [u8]>, &Path), Error> {
     Ok(match path {
         None => (SHIPPED.into(), Path::new("the shipped checkpoint")),
         Some(path) => {
-            let io = |source| Error::Io { path: path.into(), source };
             // A folder or a device has no size to read up to.
-            if !std::fs::metadata(path).map_err(io)?.is_file() {
+            if !std::fs::metadata(path).map_err(IoError::at(path))?.is_file() {
                 return Err(Error::input(path.display().to_string(), "a checkpoint file", "a folder or a device"));
             }
-            (std::fs::read(path).map_err(io)?.into(), path)
+            (std::fs::read(path).map_err(IoError::at(path))?.into(), path)
         }
     })
 }
@@ -43,7 +42,7 @@ pub fn checkpoint_bytes(path: Option<&Path>) -> Result<Cow<'static, [u8]>, Error
 /// If the file cannot be read.
 pub fn checkpoint_sha256(path: Option<&Path>) -> Result<String, Error> {
     let (bytes, _) = read(path)?;
-    Ok(Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect())
+    Ok(sha256(&bytes))
 }
 
 /// What this checkpoint, or the shipped one, says of itself. Its weights stay unread, and its encoder's are not needed.

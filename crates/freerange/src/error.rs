@@ -1,5 +1,6 @@
 use std::path::PathBuf;
 
+use freerange_core::{Invalid, IoError};
 use freerange_flow::FlowError;
 
 /// Why there is no reconstruction.
@@ -10,15 +11,8 @@ pub enum Error {
     #[error("cancelled")]
     Cancelled,
     /// A view or an option cannot be used.
-    #[error("{field}: expected {expected}, found {found}")]
-    Input {
-        /// Which one.
-        field: String,
-        /// What it may be.
-        expected: String,
-        /// What it is.
-        found: String,
-    },
+    #[error(transparent)]
+    Input(#[from] Invalid),
     /// A device that this program does not have, or that cannot do what is asked of it.
     #[error("{0}")]
     NoDevice(String),
@@ -26,13 +20,8 @@ pub enum Error {
     #[error("{0}")]
     BrokenDevice(String),
     /// Reading or writing a file failed.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// The reason.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    Io(#[from] IoError),
     /// A picture could not be written.
     #[error("{}: {source}", path.display())]
     Picture {
@@ -77,7 +66,7 @@ impl Error {
     }
 
     pub(crate) fn input(field: impl Into<String>, expected: impl Into<String>, found: impl ToString) -> Self {
-        Self::Input { field: field.into(), expected: expected.into(), found: found.to_string() }
+        Self::Input(Invalid::new(field, expected, found))
     }
 }
 

@@ -33,6 +33,7 @@ mod error;
 pub mod machine;
 mod options;
 pub mod pictures;
+mod placed;
 mod progress;
 mod reconstructor;
 mod score;

@@ -6,6 +6,7 @@ use freerange_camera::{
     Camera,
     image_ops::{composite, to_picture},
 };
+use freerange_core::IoError;
 use freerange_raster::{RasterConfig, render};
 use freerange_splat::Cloud;
 use glam::DVec3;
@@ -34,7 +35,7 @@ pub fn on_white(image: &RgbaImage) -> RgbaImage {
 /// # Errors
 /// If the file cannot be written, or the rasteriser refuses the cloud.
 pub fn write_turntable(path: &Path, cloud: &Cloud, frames: u32, size: u32) -> Result<(), Error> {
-    let file = std::fs::File::create(path).map_err(|source| Error::Io { path: path.into(), source })?;
+    let file = std::fs::File::create(path).map_err(IoError::at(path))?;
     let mut encoder = gif::GifEncoder::new_with_speed(std::io::BufWriter::new(file), 10);
     let broken = |source: image::ImageError| Error::Picture { path: path.into(), source };
     encoder.set_repeat(gif::Repeat::Infinite).map_err(broken)?;

@@ -4,12 +4,17 @@ use std::{ops::ControlFlow, path::Path, time::Instant};
 
 use burn::tensor::Device;
 use freerange_camera::{CanonicalFrame, FrameConfig, Similarity, View, canonical_from_user, inputs_around};
-use freerange_fit::{FitProgress, HoldConfig, RefineConfig, frame_of, quick_fit, refine, tree_slice};
+use freerange_fit::{FitProgress, HoldConfig, RefineConfig, refine, tree_slice};
 use freerange_flow::sample::{Estimate, SampleConfig, StartConfig, reconstruct};
 use freerange_model::Checkpoint;
 use freerange_splat::Cloud;
 
-use crate::{EncoderPlaces, Error, Options, Progress, Stage, load_checkpoint, progress::Known, require};
+use crate::{
+    EncoderPlaces, Error, Options, Progress, Stage, load_checkpoint,
+    placed::{Placed, watched},
+    progress::Known,
+    require,
+};
 
 /// A model on a device, ready to reconstruct one object after the other.
 #[derive(Clone, Debug)]
@@ -128,101 +133,64 @@ impl Reconstructor {
     ) -> Result<Reconstruction, Error> {
         self.check(options)?;
         check_views(views)?;
-        let mut seconds = Vec::new();
         let mut tell = |p: &Progress<'_>| match progress(p) {
             ControlFlow::Continue(()) => Ok(()),
             ControlFlow::Break(()) => Err(Error::Cancelled),
         };
+        let mut seconds = Vec::new();
 
         let begin = Instant::now();
         tell(&Progress::new(Stage::Frame, 0, 1))?;
-        let (mut frame, mut canonical) = to_canonical(views, &options.frame)?;
-        let chosen = choose_views(views, options.views.unwrap_or(self.views()))?;
-        if chosen.len() < views.len() {
-            let names: Vec<&str> = chosen.iter().map(|&i| views[i].name.as_str()).collect();
-            let (shown, all) = (chosen.len(), views.len());
-            frame.notes.push(format!("the model is shown {shown} of {all} views: {}", names.join(", ")));
-        }
-        let mut shown: Vec<View> = chosen.iter().map(|&i| canonical[i].clone()).collect();
-        let uneven = shown.iter().filter(|v| v.image.width() != v.image.height()).count();
-        if uneven > 0 {
-            let all = shown.len();
-            frame
-                .notes
-                .push(format!("{uneven} of {all} views are not square: the model is shown squares, cut or padded"));
-        }
+        let mut placed = Placed::new(views, &options.frame, options.views.unwrap_or(self.views()))?;
         seconds.push((Stage::Frame, begin.elapsed().as_secs_f64()));
 
         // Samples that nothing is made of have no use for others beside them.
         let members = if options.sample.refine > 0 { options.sample.ensemble } else { 1 };
-        let begin = Instant::now();
         let mut fits = Vec::new();
-        if let Some(StartConfig { fit: config, .. }) = &options.sample.start {
-            for member in 0..members {
-                let done = [member * config.iterations, members * config.iterations];
-                let seed = member as u64;
-                // The other members only help the first: nobody is shown them.
-                let place = (member == 0).then_some(&frame.canonical_from_user);
-                let mut fit = watched(Stage::Fit, 0, place, &mut tell, done, |p| quick_fit(&shown, config, seed, p))?;
-                // The fit knows better than the masks where the object is; it moves along, so that one is enough.
-                if member == 0 && !frame.kept {
-                    let correction = frame_of(&fit, &shown)?;
-                    fit.transform(correction.scale, correction.rotation, correction.translation);
-                    canonical = moved(&canonical, &correction);
-                    shown = moved(&shown, &correction);
-                    frame.canonical_from_user = correction.after(&frame.canonical_from_user);
-                    let (shift, scale) = (correction.translation.length(), correction.scale);
-                    frame.notes.push(format!("the quick fit moved it by {shift:.3} and scaled it by {scale:.3}"));
-                }
-                fits.push(fit);
-            }
+        if let Some(StartConfig { fit, .. }) = &options.sample.start {
+            let begin = Instant::now();
+            fits = placed.quick_fits(fit, members, &mut tell)?;
             seconds.push((Stage::Fit, begin.elapsed().as_secs_f64()));
         }
-        let canonical_from_user = frame.canonical_from_user;
 
         let begin = Instant::now();
-        let (steps, total) = (options.sample.steps, members * options.sample.steps);
-        tell(&Progress::new(Stage::Sample, 0, total))?;
-        let mut clouds = vec![Vec::with_capacity(members); options.seeds.len()]; // [seeds][members]
-        for member in 0..members {
-            let told = |estimate: &Estimate<'_>| {
-                let told = Progress::new(Stage::Sample, member * steps + estimate.index + 1, total);
-                let known = (member == 0).then_some((Known::Sampled(estimate), &canonical_from_user));
-                tell(&Progress { estimate: known, ..told })
-            };
-            let sampled = self.sample(&shown, fits.get(member), options, member as u64, told)?;
-            clouds.iter_mut().zip(sampled).for_each(|(members, cloud)| members.push(cloud));
-        }
+        let clouds = self.ensembles(&placed, &fits, options, members, &mut tell)?;
         seconds.push((Stage::Sample, begin.elapsed().as_secs_f64()));
 
         let begin = Instant::now();
         let mut samples = Vec::with_capacity(clouds.len());
-        for (i, (&seed, mut members)) in options.seeds.iter().zip(clouds).enumerate() {
-            let plain = members.remove(0);
-            let refined = match options.sample.refine {
-                0 => None,
-                steps => {
-                    // What several agree on is held more firmly than a guess.
-                    let hold = match members.is_empty() {
-                        true => HoldConfig::default(),
-                        false => HoldConfig { weight: 0.3, views: 24, ..HoldConfig::default() },
-                    };
-                    let config = RefineConfig { steps, hold, seed, ..RefineConfig::default() };
-                    let refined =
-                        |p: &mut dyn FnMut(&FitProgress<'_>) -> _| refine(&plain, &members, &canonical, &config, p);
-                    Some(watched(Stage::Refine, i, Some(&canonical_from_user), &mut tell, [0, steps], refined)?)
-                }
-            };
-            let (canonical, unrefined) = match refined {
-                Some(refined) => (refined, Some(to_user(&plain, &canonical_from_user))),
-                None => (plain, None),
-            };
-            samples.push(Sample { seed, gaussians: to_user(&canonical, &canonical_from_user), unrefined, canonical });
+        for (i, members) in clouds.into_iter().enumerate() {
+            samples.push(finished(i, members, &placed, options, &mut tell)?);
         }
         if options.sample.refine > 0 {
             seconds.push((Stage::Refine, begin.elapsed().as_secs_f64()));
         }
-        Ok(Reconstruction { samples, shown: chosen, canonical_from_user, notes: frame.notes, seconds })
+        let Placed { frame: CanonicalFrame { canonical_from_user, notes, .. }, chosen, .. } = placed;
+        Ok(Reconstruction { samples, shown: chosen, canonical_from_user, notes, seconds })
+    }
+
+    /// All members of the ensemble of each seed, the sample itself first. `[seeds][members]`
+    fn ensembles(
+        &self,
+        placed: &Placed,
+        fits: &[Cloud],
+        options: &Options,
+        members: usize,
+        tell: &mut impl FnMut(&Progress<'_>) -> Result<(), Error>,
+    ) -> Result<Vec<Vec<Cloud>>, Error> {
+        let (steps, total) = (options.sample.steps, members * options.sample.steps);
+        tell(&Progress::new(Stage::Sample, 0, total))?;
+        let mut clouds = vec![Vec::with_capacity(members); options.seeds.len()];
+        for member in 0..members {
+            let told = |estimate: &Estimate<'_>| {
+                let told = Progress::new(Stage::Sample, member * steps + estimate.index + 1, total);
+                let known = (member == 0).then_some((Known::Sampled(estimate), &placed.frame.canonical_from_user));
+                tell(&Progress { estimate: known, ..told })
+            };
+            let sampled = self.sample(&placed.shown, fits.get(member), options, member as u64, told)?;
+            clouds.iter_mut().zip(sampled).for_each(|(members, cloud)| members.push(cloud));
+        }
+        Ok(clouds)
     }
 
     /// One cloud per seed, of member `member` of an ensemble, for views in the canonical frame and their quick fit, if
@@ -286,27 +254,32 @@ pub fn choose_views(views: &[View], most: usize) -> Result<Vec<usize>, Error> {
     }
 }
 
-/// A fit whose steps are told, as those after so many of so many; what it has when it is stopped is of no use.
-fn watched(
-    stage: Stage,
-    sample: usize,
-    canonical_from_user: Option<&Similarity>,
+/// Sample `i`, refined if that is asked for, and in the user's frame, of the members of its ensemble.
+fn finished(
+    i: usize,
+    mut members: Vec<Cloud>,
+    placed: &Placed,
+    options: &Options,
     tell: &mut impl FnMut(&Progress<'_>) -> Result<(), Error>,
-    [before, total]: [usize; 2],
-    fit: impl FnOnce(&mut dyn FnMut(&FitProgress<'_>) -> ControlFlow<()>) -> Result<Cloud, freerange_fit::FitError>,
-) -> Result<Cloud, Error> {
-    if before == 0 {
-        tell(&Progress { sample, ..Progress::new(stage, 0, total) })?;
-    }
-    let mut stopped = Ok(());
-    let cloud = fit(&mut |p| {
-        let estimate = canonical_from_user.map(|place| (Known::Fitted(p.cloud), place));
-        let loss = Some(p.loss);
-        stopped = tell(&Progress { sample, loss, estimate, ..Progress::new(stage, before + p.step, total) });
-        if stopped.is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
-    });
-    stopped?;
-    Ok(cloud?)
+) -> Result<Sample, Error> {
+    let (seed, place) = (options.seeds[i], &placed.frame.canonical_from_user);
+    let plain = members.remove(0);
+    let (canonical, unrefined) = match options.sample.refine {
+        0 => (plain, None),
+        steps => {
+            // What several agree on is held more firmly than a guess.
+            let hold = match members.is_empty() {
+                true => HoldConfig::default(),
+                false => HoldConfig { weight: 0.3, views: 24, ..HoldConfig::default() },
+            };
+            let config = RefineConfig { steps, hold, seed, ..RefineConfig::default() };
+            let fit =
+                |p: &mut dyn FnMut(&FitProgress<'_>) -> _| refine(&plain, &members, &placed.canonical, &config, p);
+            let refined = watched(Stage::Refine, i, Some(place), tell, [0, steps], fit)?;
+            (refined, Some(to_user(&plain, place)))
+        }
+    };
+    Ok(Sample { seed, gaussians: to_user(&canonical, place), unrefined, canonical })
 }
 
 /// Refuses views whose parts do not fit each other.
@@ -336,7 +309,7 @@ pub fn to_canonical(views: &[View], config: &FrameConfig) -> Result<(CanonicalFr
     Ok((frame, canonical))
 }
 
-fn moved(views: &[View], to: &Similarity) -> Vec<View> {
+pub(crate) fn moved(views: &[View], to: &Similarity) -> Vec<View> {
     views.iter().map(|v| View { camera: v.camera.transformed(to), ..v.clone() }).collect()
 }
 

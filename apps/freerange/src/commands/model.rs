@@ -3,10 +3,12 @@
 use std::path::PathBuf;
 
 use freerange::{EncoderPlaces, checkpoint_header, load_checkpoint};
-use freerange_flow::config::TrainConfig;
 use freerange_model::{Compute, Execution, ModelConfig, ModelInfo, WeightsOrigin, Workload};
 
-use crate::{error::CliError, runtime};
+use crate::{
+    error::CliError,
+    runtime::{self, TrainConfig},
+};
 
 /// Look at models.
 #[derive(clap::Subcommand)]

@@ -4,6 +4,7 @@ use std::{net::IpAddr, ops::ControlFlow, path::PathBuf, process::Command, sync::
 
 use freerange::{Camera, Cloud, Reconstructor, Stage, View, choose_views, pictures::render_view};
 use freerange_camera::image_ops::to_picture;
+use freerange_core::IoError;
 use freerange_serve::{
     Engine, EngineError, Example, JobOptions, Limits, Outcome, Scene, ServeConfig, ServeError, Server, Start, Step,
 };
@@ -13,6 +14,7 @@ use image::RgbaImage;
 use crate::{
     commands::reconstruct::{Sampling, StartName},
     error::CliError,
+    signals::Signals,
 };
 
 /// Serve a page: drop photos with cameras, mend masks, and watch the Gaussians appear.
@@ -84,8 +86,12 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         },
     };
     config.check()?;
-    // Before there are other threads, which take over what is set here.
     let signals = Signals::take();
+    #[cfg(unix)]
+    // SAFETY: ignoring runs no code of ours. A connection that a client has closed must not end the program.
+    unsafe {
+        libc::signal(libc::SIGPIPE, libc::SIG_IGN);
+    }
     let device = args.sampling.device.open()?;
     let model = args.sampling.open(&device)?;
     args.sampling.options(&model, 1)?;
@@ -95,7 +101,8 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     };
     let engine = Local { model, sampling: args.sampling.clone(), name: format!("{place} on {}", args.sampling.device) };
     let server = Server::bind(&config, Arc::new(engine))?;
-    signals.end(&server)?;
+    let stopper = server.stopper();
+    signals.on_first(move || stopper.stop())?;
     let url = match &args.token {
         Some(token) => format!("{}?token={token}", server.url()),
         None => server.url(),
@@ -119,65 +126,10 @@ fn open(url: &str) {
     }
 }
 
-/// Ctrl-C and the system's request to end.
-struct Signals;
-
-#[cfg(unix)]
-impl Signals {
-    fn set() -> libc::sigset_t {
-        // SAFETY: both calls initialise or change this set alone.
-        unsafe {
-            let mut set = std::mem::zeroed();
-            libc::sigemptyset(&mut set);
-            libc::sigaddset(&mut set, libc::SIGINT);
-            libc::sigaddset(&mut set, libc::SIGTERM);
-            set
-        }
-    }
-
-    /// Keeps them for the thread that waits for them. A connection that a client has closed must not end the program.
-    fn take() -> Self {
-        // SAFETY: no other thread is there yet; the set is initialised, and ignoring runs no code of ours.
-        unsafe {
-            libc::pthread_sigmask(libc::SIG_BLOCK, &Self::set(), std::ptr::null_mut());
-            libc::signal(libc::SIGPIPE, libc::SIG_IGN);
-        }
-        Self
-    }
-
-    /// The first ends the server in order, the second at once.
-    fn end(self, server: &Server) -> Result<(), CliError> {
-        let stopper = server.stopper();
-        let wait = || {
-            let mut signal = 0;
-            // SAFETY: both places are ours and initialised.
-            unsafe { libc::sigwait(&Self::set(), &mut signal) };
-            signal
-        };
-        let waits = move || {
-            wait();
-            stopper.stop();
-            std::process::exit(128 + wait());
-        };
-        std::thread::Builder::new().name("signals".into()).spawn(waits).map(drop).map_err(CliError::failure)
-    }
-}
-
-#[cfg(not(unix))]
-impl Signals {
-    fn take() -> Self {
-        Self
-    }
-
-    fn end(self, _: &Server) -> Result<(), CliError> {
-        Ok(())
-    }
-}
-
 impl From<ServeError> for CliError {
     fn from(e: ServeError) -> Self {
         match e {
-            ServeError::Folder { path, source } => Self::file(&path, source),
+            ServeError::Folder(IoError { path, source }) => Self::file(&path, source),
             e => Self::input(e),
         }
     }

@@ -2,6 +2,10 @@
 
 use std::{
     path::{Path, PathBuf},
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
     time::{Duration, Instant},
 };
 
@@ -11,7 +15,6 @@ use freerange_core::sha256_of;
 use freerange_flow::{
     FlowError,
     batch::step_rng,
-    config::TrainConfig,
     events::Events,
     log::Log,
     trainer::{Among, Initial, StepReport, Trainer, Validated},
@@ -23,7 +26,8 @@ use crate::{
     error::CliError,
     progress::Progress,
     ranks::Job,
-    runtime::{commit, local_or_shipped},
+    runtime::{TrainConfig, commit, local_or_shipped},
+    signals::{EXIT_CODE, Signals},
 };
 
 /// Train a model. Run the same command again to go on where it was stopped.
@@ -53,7 +57,7 @@ pub struct Args {
     /// With --initial: normalise by the statistics of this run's data instead of the checkpoint's, for data made otherwise.
     #[arg(long, requires = "initial")]
     remeasure: bool,
-    /// Stop after so many minutes (the state is saved).
+    /// Stop after so many minutes (the state is saved, as it is at Ctrl-C and SIGTERM).
     #[arg(long)]
     minutes: Option<f64>,
     /// Steps between two saved states.
@@ -66,12 +70,16 @@ pub struct Args {
 
 pub fn run(args: &Args) -> Result<(), CliError> {
     let begin = Instant::now();
+    let signals = Signals::take();
+    let interrupt = Arc::new(Interrupt::default());
+    let hear = interrupt.clone();
+    signals.on_first(move || hear.ask())?;
     let job = Job::start()?;
-    let result = train(args, &job, begin);
+    let result = train(args, &job, &interrupt, begin);
     job.end(result)
 }
 
-fn train(args: &Args, job: &Job, begin: Instant) -> Result<(), CliError> {
+fn train(args: &Args, job: &Job, interrupt: &Arc<Interrupt>, begin: Instant) -> Result<(), CliError> {
     let say = |text: &str| {
         if job.first() {
             eprintln!("{text}");
@@ -109,9 +117,11 @@ fn train(args: &Args, job: &Job, begin: Instant) -> Result<(), CliError> {
     let trainer = Trainer::open_among(among, config, output, initial, encoder.as_ref(), &device, say);
     let mut trainer = job.together(trainer.map_err(CliError::from))?;
     let allowed = args.minutes.and_then(|minutes| Duration::try_from_secs_f64(60.0 * minutes.max(0.0)).ok());
-    if let Some(time) = allowed.and_then(|allowed| begin.checked_add(allowed)) {
-        trainer.stop_at(time);
-    }
+    let over = allowed.and_then(|allowed| begin.checked_add(allowed));
+    let asked = interrupt.clone();
+    interrupt.among.store(job.world() > 1, Ordering::Relaxed);
+    interrupt.stepping.store(true, Ordering::Relaxed);
+    trainer.stop_when(move || asked.asked.load(Ordering::Relaxed) || over.is_some_and(|time| Instant::now() >= time));
     // Rank 0 speaks and writes for all.
     let journal = || Journal::open(output, trainer.step_count(), total).map_err(CliError::from);
     let mut journal = job.together(if job.first() { journal().map(Some) } else { Ok(None) })?;
@@ -129,6 +139,7 @@ fn train(args: &Args, job: &Job, begin: Instant) -> Result<(), CliError> {
                 return job.together(Err(e.into()));
             }
         };
+        interrupt.heard.store(report.stop, Ordering::Relaxed);
         if let Some(journal) = &mut journal {
             journal.step(&report)?;
         }
@@ -137,11 +148,11 @@ fn train(args: &Args, job: &Job, begin: Instant) -> Result<(), CliError> {
         {
             journal.validated(&validated)?;
         }
-        if report.step % args.save_every == 0 || report.step == total || report.out_of_time {
+        if report.step % args.save_every == 0 || report.step == total || report.stop {
             journal.as_mut().map_or(Ok(()), Journal::sync)?;
             trainer.save()?;
         }
-        if report.out_of_time {
+        if report.stop {
             break;
         }
     }
@@ -149,7 +160,45 @@ fn train(args: &Args, job: &Job, begin: Instant) -> Result<(), CliError> {
         bar.finish();
         println!("{} of {total} steps; {}", trainer.step_count(), output.join("checkpoint.safetensors").display());
     }
+    // A launcher would take it for a failure, and end the others while rank 0 may still be writing.
+    if interrupt.asked.load(Ordering::Relaxed) && trainer.step_count() < total && job.world() == 1 {
+        return Err(CliError::asked_to_end("the same command goes on from here"));
+    }
     Ok(())
+}
+
+/// Among several ranks: for so long the step may take after which a run is to end. One that waits for a rank which is gone
+/// waits for ever, and launchers that end the others ask first.
+const PATIENCE: Duration = Duration::from_secs(8);
+
+/// What the user, or the system, wants of a run.
+#[derive(Default)]
+struct Interrupt {
+    asked: AtomicBool,    // to end
+    stepping: AtomicBool, // there is something to save
+    among: AtomicBool,    // several ranks
+    heard: AtomicBool,    // by the run itself
+}
+
+impl Interrupt {
+    /// At the first signal. Before there is anything to save, that ends the process.
+    fn ask(self: Arc<Self>) {
+        let end = || std::process::exit(EXIT_CODE.into());
+        if !self.stepping.load(Ordering::Relaxed) {
+            end();
+        }
+        self.asked.store(true, Ordering::Relaxed);
+        eprintln!("asked to end: saving after this step; once more ends at once");
+        if self.among.load(Ordering::Relaxed) {
+            std::thread::spawn(move || {
+                std::thread::sleep(PATIENCE);
+                if !self.heard.load(Ordering::Relaxed) {
+                    eprintln!("the other ranks do not answer");
+                    end();
+                }
+            });
+        }
+    }
 }
 
 /// What a run tells: on the terminal, in log.jsonl, to TensorBoard.

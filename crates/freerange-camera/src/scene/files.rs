@@ -5,6 +5,7 @@ use super::{
     json::{Description, FrameDescription, LARGEST_SIDE},
 };
 use crate::{CameraError, Lens, View};
+use freerange_core::IoError;
 use image::{DynamicImage, ImageDecoder, ImageReader, RgbaImage};
 use std::{
     ffi::OsString,
@@ -50,9 +51,8 @@ fn decoder(path: &Path, frame: &FrameDescription) -> Result<impl ImageDecoder + 
     limits.max_image_width = Some(LARGEST_SIDE);
     limits.max_image_height = Some(LARGEST_SIDE);
     limits.max_alloc = Some(LARGEST_DECODE);
-    let mut reader = ImageReader::open(path)
-        .and_then(|reader| reader.with_guessed_format())
-        .map_err(|source| CameraError::Read { file: path.to_path_buf(), source })?;
+    let mut reader =
+        ImageReader::open(path).and_then(|reader| reader.with_guessed_format()).map_err(IoError::at(path))?;
     reader.limits(limits);
     reader.into_decoder().map_err(failed)
 }

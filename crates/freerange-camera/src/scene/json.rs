@@ -2,6 +2,7 @@
 
 use super::{files, pose};
 use crate::{Camera, CameraError, Lens, error::Place};
+use freerange_core::IoError;
 use glam::DMat4;
 use serde_json::{Map, Value};
 use std::{
@@ -342,11 +343,11 @@ fn describe(value: &Value) -> String {
 }
 
 fn read_limited(file: &Path) -> Result<Vec<u8>, CameraError> {
-    let failed = |source| CameraError::Read { file: file.to_path_buf(), source };
+    let failed = |e| IoError::at(file)(e);
     // A pipe or device would never end.
     let metadata = std::fs::metadata(file).map_err(failed)?;
     if !metadata.is_file() {
-        return Err(failed(std::io::Error::other("not a regular file")));
+        return Err(failed(std::io::Error::other("not a regular file")).into());
     }
     let mut bytes = Vec::new();
     std::fs::File::open(file).and_then(|f| f.take(LARGEST_FILE + 1).read_to_end(&mut bytes)).map_err(failed)?;

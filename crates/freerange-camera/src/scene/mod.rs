@@ -16,6 +16,8 @@ pub use json::{Description, FrameDescription};
 pub use pose::nearest_rotation;
 pub use write::transforms_json;
 
+use freerange_core::IoError;
+
 use crate::{Camera, CameraError, View, error::Place};
 use files::Images;
 use std::path::{Path, PathBuf};
@@ -100,8 +102,7 @@ pub struct Found {
 impl Found {
     /// Looks into a folder, or takes one file as it is.
     pub fn at(path: &Path) -> Result<Self, CameraError> {
-        let unreadable = |source| CameraError::Read { file: path.to_path_buf(), source };
-        if !std::fs::metadata(path).map_err(unreadable)?.is_dir() {
+        if !std::fs::metadata(path).map_err(IoError::at(path))?.is_dir() {
             return Ok(Self { inputs: path.to_path_buf(), further: None, notes: Vec::new() });
         }
         let there = |name: &str| Some(path.join(name)).filter(|p| p.is_file());
@@ -116,7 +117,7 @@ impl Found {
             return Ok(Self { inputs, further, notes: Vec::new() });
         }
         let mut others: Vec<String> = std::fs::read_dir(path)
-            .map_err(unreadable)?
+            .map_err(IoError::at(path))?
             .flatten()
             .map(|entry| entry.file_name().to_string_lossy().into_owned())
             .filter(|name| name.ends_with(".json"))

@@ -1,10 +1,27 @@
-use std::io::{Seek, SeekFrom, Write};
+use std::{
+    io::{Seek, SeekFrom, Write},
+    path::Path,
+};
 
-use freerange_build::{BuildOptions, Items, build};
+use burn::tensor::Tensor;
+use freerange_build::{BuildConfig, BuildOptions, Items, MakingConfig, build};
+use freerange_data::{Shards, Split, Store};
+use freerange_model::EncoderConfig;
 
-use super::*;
-use crate::ranks::threads::among;
-use crate::sample::SampleConfig;
+use super::{
+    folder::claim,
+    step::{GRADIENT_STATISTIC_DECAY, NOT_FINITE_IN_A_ROW},
+    *,
+};
+use crate::{
+    config::{DataConfig, Stage},
+    optimizer::Flat,
+    ranks::threads::among,
+    sample::SampleConfig,
+    train,
+};
+
+type TrainConfig = crate::config::TrainConfig<MakingConfig>;
 
 /// A model and objects of the smallest kind.
 const SMALL: &str = r#"
@@ -64,6 +81,11 @@ fn config() -> TrainConfig {
     let config: TrainConfig = toml::from_str(SMALL).unwrap();
     config.validate().unwrap();
     config
+}
+
+/// How shards for it are made.
+fn build_config(config: &TrainConfig) -> BuildConfig {
+    config.data.making.build_config(config.seed, &config.depths())
 }
 
 fn open(config: &TrainConfig, folder: &Path, initial: Option<Initial>) -> Trainer {
@@ -131,7 +153,7 @@ fn an_unreadable_object_is_left_out_and_the_run_can_be_resumed_around_it() {
     let mut config = config();
     config.data.shards = Some(path("shards").to_str().unwrap().into());
     let store = Store::local(&path("shards"));
-    build(&config.build_config(), &Items::generated(12, 1), &store, &BuildOptions::default(), |_| ()).unwrap();
+    build(&build_config(&config), &Items::generated(12, 1), &store, &BuildOptions::default(), |_| ()).unwrap();
     let shards = Shards::open(&store, &[4], Some(Split::Train)).unwrap().shuffled_by(config.seed);
     let broken = shards.id(4).to_owned();
     let of = |s: &&freerange_data::ShardRecord| s.objects.iter().any(|o| o.id == broken);
@@ -202,10 +224,10 @@ fn a_run_finds_its_shards_from_any_folder() {
         let shards = place.path().join(shards).to_str().unwrap().to_owned();
         TrainConfig { data: crate::config::DataConfig { shards: Some(shards), ..config().data }, ..config() }
     };
-    check_same_run(&with("a/shards"), &run).unwrap();
-    check_same_run(&with("run/../a/shards"), &run).unwrap();
+    claim(&with("a/shards"), &run).unwrap();
+    claim(&with("run/../a/shards"), &run).unwrap();
     std::fs::create_dir(place.path().join("other")).unwrap();
-    check_same_run(&with("other"), &run).unwrap_err();
+    claim(&with("other"), &run).unwrap_err();
     // A folder relative to the working directory is kept as one that is not.
     let kept = std::fs::read_to_string(run.join("config.toml")).unwrap();
     assert!(toml::from_str::<TrainConfig>(&kept).unwrap().data.shards.is_some_and(|s| Path::new(&s).is_absolute()));
@@ -249,7 +271,7 @@ fn other_objects_are_measured_now_and_then_and_nothing_else_changes() {
     // Shards have objects for it, or the run does not start.
     measured.data.shards = Some(place.path().join("shards").to_str().unwrap().into());
     let store = Store::local(&place.path().join("shards"));
-    build(&measured.build_config(), &Items::generated(4, 1), &store, &BuildOptions::default(), |_| ()).unwrap();
+    build(&build_config(&measured), &Items::generated(4, 1), &store, &BuildOptions::default(), |_| ()).unwrap();
     let failed = Trainer::open(measured, &place.path().join("none"), None, &Device::flex(), |_| {}).err().unwrap();
     assert!(failed.to_string().contains("Validation"), "{failed}");
     assert!(!place.path().join("none").exists());
@@ -345,7 +367,7 @@ fn a_batch_may_be_computed_in_parts() {
 /// Shards of objects for a configuration, and that with them: they are read in no time.
 fn with_shards(mut config: TrainConfig, place: &Path) -> TrainConfig {
     let store = Store::local(&place.join("shards"));
-    build(&config.build_config(), &Items::generated(40, 1), &store, &BuildOptions::default(), |_| ()).unwrap();
+    build(&build_config(&config), &Items::generated(40, 1), &store, &BuildOptions::default(), |_| ()).unwrap();
     config.data.shards = Some(place.join("shards").to_str().unwrap().into());
     config
 }
@@ -402,7 +424,7 @@ fn close(found: &[[f32; 5]], expected: &[[f32; 5]]) {
 fn any_number_of_ranks_trains_the_same() {
     let place = tempfile::tempdir().unwrap();
     let mut config = in_lanes();
-    config.data.shard.validation = 0.2;
+    config.data.making.shard.validation = 0.2;
     let config = with_shards(config, place.path());
     let alone = told(1, &config, &place.path().join("1"), 20).remove(0);
     assert!(alone.0.iter().any(|step| step[0] != alone.0[0][0]) && alone.1.len() == 5);
@@ -528,16 +550,16 @@ fn ranks_that_cannot_train_together_are_refused() {
 }
 
 #[test]
-fn all_ranks_stop_when_one_is_out_of_time_and_weights_that_came_apart_are_told() {
+fn all_ranks_stop_when_one_is_to_and_weights_that_came_apart_are_told() {
     let place = tempfile::tempdir().unwrap();
     let config = in_lanes();
     among(2, |ranks| {
         let mut trainer = open_among(ranks.clone(), &config, &place.path().join("run")).unwrap();
-        assert!(!trainer.step().unwrap().out_of_time);
+        assert!(!trainer.step().unwrap().stop);
         if ranks.rank() == 1 {
-            trainer.stop_at(Instant::now());
+            trainer.stop_when(|| true);
         }
-        assert!(trainer.step().unwrap().out_of_time);
+        assert!(trainer.step().unwrap().stop);
         trainer.save().unwrap();
         if ranks.rank() == 1 {
             trainer.average.0[0] = trainer.average.0[0].clone() + 1e-3;

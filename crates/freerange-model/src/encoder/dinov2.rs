@@ -10,7 +10,8 @@ use burn::{
         module::layer_norm,
     },
 };
-use sha2::{Digest, Sha256};
+
+use freerange_core::sha256;
 
 use super::bicubic;
 use crate::{
@@ -116,11 +117,7 @@ impl Dinov2 {
         let bytes = read_bounded(&path)?;
         let mut file = TensorFile::parse(&path, "safetensors file", &bytes)?;
         let mut model = Self::build(&config, &mut Builder { source: &mut file, device })?.freeze();
-        let hash = Sha256::digest(&bytes);
-        model.origin = Some(WeightsOrigin {
-            name: name.to_owned(),
-            sha256: hash.iter().map(|byte| format!("{byte:02x}")).collect(),
-        });
+        model.origin = Some(WeightsOrigin { name: name.to_owned(), sha256: sha256(&bytes) });
         Ok(model)
     }
 

@@ -183,7 +183,7 @@ fn hostile_files_are_refused_by_name() {
         (tampered(&path, meta("depth", "0")), "`depth` is `0`"),
         (tampered(&path, meta("config", "{")), "`config`"),
         (tampered(&path, meta("config", big)), "expected [32, 16384]"),
-        (tampered(&path, meta("config", endless)), "`blocks`"),
+        (tampered(&path, meta("config", endless)), "blocks: expected"),
         (tampered(&path, meta("normalization", r#"{"mean":[1],"std":[1]}"#)), "`normalization`"),
         (tampered(&path, meta("gradient_rms", "[0,0,0,0,0,0,0,0,0,0,0,0,0,0]")), "`gradient_rms`"),
         (tampered(&path, |h| drop(h.remove("__metadata__"))), "lack"),

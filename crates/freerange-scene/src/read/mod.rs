@@ -12,6 +12,7 @@ pub mod turntable;
 
 use crate::{SceneError, error::In};
 use freerange_camera::{Camera, Lens, scene::nearest_rotation};
+use freerange_core::Invalid;
 use glam::{DMat3, DMat4, DVec3};
 use std::{
     collections::BTreeSet,
@@ -197,7 +198,7 @@ pub fn cameras_with(path: &Path, config: &ReadConfig) -> Result<Cameras, SceneEr
         };
         if let Some(format) = format.filter(|f| *f != own) {
             let expected = format!("{} for this file", own.name());
-            return Err(SceneError::Option { option: "--cameras", expected, found: format.name().into() });
+            return Err(Invalid::new("--cameras", expected, format.name()).into());
         }
         match own {
             Format::Colmap => colmap::read(path.parent().unwrap_or(Path::new("")), images)?,
@@ -230,22 +231,21 @@ fn without_camera(photos: &[Photo]) -> Option<String> {
 
 fn read(format: Format, file: &Path, images: Option<&Path>) -> Result<Cameras, SceneError> {
     match format {
-        Format::Transforms if images.is_some() => Err(SceneError::Option {
-            option: "--images",
-            expected: "cameras that do not say where their photos are (colmap, polycam, metashape, realitycapture)"
-                .into(),
-            found: "transforms.json, which does".into(),
-        }),
+        Format::Transforms if images.is_some() => Err(Invalid::new(
+            "--images",
+            "cameras that do not say where their photos are (colmap, polycam, metashape, realitycapture)",
+            "transforms.json, which does",
+        )
+        .into()),
         Format::Transforms => transforms::read(file),
         Format::Colmap => colmap::read(file, images),
         Format::Polycam => polycam::read(file, images),
         Format::Metashape => metashape::read(file, images),
         Format::Realitycapture => realitycapture::read(file, images),
-        Format::Turntable => Err(SceneError::Option {
-            option: "--cameras",
-            expected: "the format of a file; turntables have --turntable ELEVATION,FOV".into(),
-            found: "turntable".into(),
-        }),
+        Format::Turntable => {
+            let expected = "the format of a file; turntables have --turntable ELEVATION,FOV";
+            Err(Invalid::new("--cameras", expected, "turntable").into())
+        }
     }
 }
 
@@ -291,11 +291,10 @@ fn nothing(folder: &Path, format: Option<Format>) -> Result<SceneError, SceneErr
         .collect();
     let found = if names.is_empty() { "an empty folder".into() } else { names.join(", ") };
     Ok(match format {
-        Some(format) => SceneError::Option {
-            option: "--cameras",
-            expected: format!("a folder with {} cameras", format.name()),
-            found: format!("{}: {found}", folder.display()),
-        },
+        Some(format) => {
+            let expected = format!("a folder with {} cameras", format.name());
+            Invalid::new("--cameras", expected, format!("{}: {found}", folder.display())).into()
+        }
         None => SceneError::Nothing { folder: folder.into(), found },
     })
 }

@@ -4,7 +4,6 @@ use std::path::Path;
 
 use burn::tensor::{Distribution, Tensor, TensorData};
 use freerange_camera::Camera;
-use freerange_flow::config::TrainConfig;
 use freerange_model::{Compute, bench};
 use freerange_raster::{CHANNELS, RasterConfig, rasterize};
 use glam::{DQuat, DVec3};
@@ -12,7 +11,7 @@ use rand::SeedableRng;
 use serde::Serialize;
 
 use super::{ms, timer::Timer};
-use crate::error::CliError;
+use crate::{error::CliError, runtime::TrainConfig};
 
 /// A line about the rasteriser.
 #[derive(Serialize)]

@@ -8,7 +8,7 @@ use freerange_camera::View;
 use freerange_fit::quick_fit;
 use freerange_flow::{
     batch::{Conditioning, shrink},
-    config::{Stage, TrainConfig},
+    config::Stage,
     photometric::{Images, Photometric},
     sample::{SampleConfig, reconstruct},
     trainer::Trainer,
@@ -19,7 +19,7 @@ use rand::SeedableRng;
 use serde::Serialize;
 
 use super::{ms, reserved, timer::Timer};
-use crate::error::CliError;
+use crate::{error::CliError, runtime::TrainConfig};
 
 /// Views given to the model: the paper's number.
 const VIEWS: usize = 4;
@@ -80,11 +80,11 @@ pub(super) fn load(size: &str) -> Result<TrainConfig, CliError> {
     if let EncoderConfig::Dinov2(encoder) = &mut config.model.encoder {
         (encoder.weights, encoder.random) = (None, true);
     }
-    config.data.object.gaussians = GaussianSource::Surface;
-    config.data.object.polish = 0;
+    config.data.making.object.gaussians = GaussianSource::Surface;
+    config.data.making.object.polish = 0;
     let most = config.stages.iter().map(|s| 1usize << s.depth).max().unwrap_or(1);
-    config.data.object.surface.points = config.data.object.surface.points.max(2 * most);
-    config.data.object.views = config.loss.input_views.1.max(VIEWS) + config.loss.held_views;
+    config.data.making.object.surface.points = config.data.making.object.surface.points.max(2 * most);
+    config.data.making.object.views = config.loss.input_views.1.max(VIEWS) + config.loss.held_views;
     Ok(config)
 }
 
@@ -100,7 +100,7 @@ pub fn sample(
     let config = load(size)?;
     let (stage, device) = (config.stage(u64::MAX).clone(), &timer.device);
     let model_config = ModelConfig { image_size: stage.image_size, ..config.model.clone() };
-    let object = generate_object(7, &config.data.object, &[stage.depth])?;
+    let object = generate_object(7, &config.data.making.object, &[stage.depth])?;
     let mut statistics = Statistics::default();
     statistics.add(object.slice(stage.depth)?)?;
     let rng = &mut rand_chacha::ChaCha8Rng::seed_from_u64(1);

@@ -6,9 +6,12 @@ use std::sync::Mutex;
 use freerange_build::{BuildConfig, BuildOptions, GaussianSource, Items, Seconds, Share, Summary, build};
 use freerange_data::{HeldOutPsnr, Store};
 use freerange_eval::memory::peak_memory;
-use freerange_flow::config::TrainConfig;
 
-use crate::{error::CliError, progress::Progress};
+use crate::{
+    error::CliError,
+    progress::Progress,
+    runtime::{TrainConfig, build_config},
+};
 
 /// Arguments of `data build`.
 #[derive(clap::Args)]
@@ -122,7 +125,7 @@ enum Source {
 impl Settings {
     /// The configuration with what the arguments change. `default_source` where neither says where Gaussians come from.
     pub fn build_config(&self, default_source: Option<GaussianSource>) -> Result<BuildConfig, CliError> {
-        let mut config = TrainConfig::load(&self.config)?.build_config();
+        let mut config = build_config(&TrainConfig::load(&self.config)?);
         let given = self.gaussians.map(|s| match s {
             Source::Fit => GaussianSource::Fit,
             Source::Surface => GaussianSource::Surface,

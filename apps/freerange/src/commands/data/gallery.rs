@@ -3,9 +3,8 @@
 use std::path::PathBuf;
 
 use freerange_build::{GalleryConfig, gallery};
-use freerange_flow::config::TrainConfig;
 
-use crate::error::CliError;
+use crate::{error::CliError, runtime::TrainConfig};
 
 /// Arguments of `data gallery`.
 #[derive(clap::Args)]
@@ -31,7 +30,7 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> Result<(), CliError> {
-    let object = TrainConfig::load(&args.config)?.data.object;
+    let object = TrainConfig::load(&args.config)?.data.making.object;
     let config = GalleryConfig {
         objects: args.objects,
         columns: args.columns,

@@ -9,10 +9,12 @@ use freerange_build::{BuildConfig, Item, Items, render_views};
 use freerange_camera::{Scene, View};
 use freerange_data::{ObjectSource, Shards, Split, Store};
 use freerange_eval::{EvalObject, runner::Objects};
-use freerange_flow::config::TrainConfig;
 use serde_json::{Value, json};
 
-use crate::error::CliError;
+use crate::{
+    error::CliError,
+    runtime::{TrainConfig, build_config},
+};
 
 /// Where the objects come from: one of `--scenes`, `--data`, `--generated`.
 #[derive(clap::Args)]
@@ -91,7 +93,7 @@ impl SourceArgs {
                 (Kind::Shards(Box::new(shards)), names, json!({ "kind": "data", "plan_sha256": plan, "split": split }))
             }
             (None, None, Some(count)) => {
-                let mut config = TrainConfig::load(&self.config)?.build_config();
+                let mut config = build_config(&TrainConfig::load(&self.config)?);
                 if let Some(size) = self.generated_size {
                     config.object.cameras.resolution = size;
                 }

@@ -1,0 +1,255 @@
+//! How to sample: what a configuration and the options of the command line say.
+
+use freerange_core::Invalid;
+use freerange_fit::QuickFitConfig;
+use freerange_model::Compute;
+
+use super::{Background, sampler::PhotometricStep, solver::Solver};
+use crate::{FlowError, coupling::Coupling};
+
+/// How to sample.
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SampleConfig {
+    /// Steps from noise to data.
+    pub steps: usize,
+    /// How they are taken.
+    pub solver: Solver,
+    /// Make `2^depth` Gaussians; left out: as many as at the depth the model was trained at. Tokens carry no position,
+    /// so that any number can be drawn, but sizes are those of the trained depth.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub depth: Option<u32>,
+    /// Start from a quick fit of the input views instead of pure noise.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub start: Option<StartConfig>,
+    /// Classifier-free guidance scale s: `z_u + s (z_c - z_u)`. 1 switches it off (and halves the work).
+    #[serde(alias = "guidance")]
+    pub cfg_scale: f32,
+    /// Photometric guidance scale lambda_PG. 0 switches it off. What it multiplies is told by `photometric_step`. It acts
+    /// on what the next step starts from, and on the result where there is one step only.
+    #[serde(alias = "photometric")]
+    pub lambda_pg: f32,
+    /// The gradient that photometric guidance follows.
+    pub photometric_step: PhotometricStep,
+    /// Photometric steps per step of the solver, each at the estimate that the one before has moved. The paper takes one.
+    pub photometric_repeats: usize,
+    /// Side, in pixels, of the renders that photometric guidance compares with the images; left out: `gradient_size`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub photometric_size: Option<u32>,
+    /// Where the gradient that the network sees as input is taken.
+    pub gradient_at: GradientAt,
+    /// Side, in pixels, of the renders that the gradient for the network is taken on: as in training.
+    pub gradient_size: u32,
+    /// Colour behind the object in those renders.
+    pub background: Background,
+    /// How the starting noise is grouped into tokens: as in training.
+    pub coupling: Coupling,
+    /// Arithmetic of the transformer's blocks.
+    pub compute: Compute,
+    /// Steps of 3DGS-MCMC on the input views that follow ([`freerange_fit::refine`]); [`reconstruct`] itself takes none.
+    pub refine: usize,
+    /// How many samples refinement is held at the mean pictures of, each from a fit and noise of its own; what is refined is the
+    /// first. [`reconstruct`] itself draws what it is asked for.
+    #[serde(skip_serializing_if = "is_one")]
+    pub ensemble: usize,
+    /// Steps of [`Solver::Hold`] that follow a sample from pure noise, with it in the place of a fit. [`reconstruct`] itself
+    /// takes none.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub mend: usize,
+    /// What is different where a model that starts from fits by itself is asked to start from pure noise; left out: nothing.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub from_noise: Option<FromNoise>,
+}
+
+/// How a model samples from pure noise that by itself starts from fits.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FromNoise {
+    /// [`SampleConfig::steps`]
+    pub steps: usize,
+    /// [`SampleConfig::solver`]
+    pub solver: Solver,
+    /// [`SampleConfig::lambda_pg`]
+    #[serde(alias = "photometric")]
+    pub lambda_pg: f32,
+    /// [`SampleConfig::mend`]
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub mend: usize,
+}
+
+impl Default for SampleConfig {
+    fn default() -> Self {
+        Self {
+            steps: 50,
+            solver: Solver::Euler,
+            depth: None,
+            start: None,
+            cfg_scale: 2.0,
+            lambda_pg: 50.0,
+            photometric_step: PhotometricStep::Gradient,
+            photometric_repeats: 1,
+            photometric_size: None,
+            gradient_at: GradientAt::Noisy,
+            gradient_size: 512,
+            background: Background::Random,
+            coupling: Coupling::Independent,
+            compute: Compute::F32,
+            refine: 0,
+            ensemble: 1,
+            mend: 0,
+            from_noise: None,
+        }
+    }
+}
+
+fn is_zero(x: &usize) -> bool {
+    *x == 0
+}
+
+fn is_one(x: &usize) -> bool {
+    *x == 1
+}
+
+impl SampleConfig {
+    /// The same from pure noise: see [`from_noise`](Self::from_noise).
+    pub fn without_start(mut self) -> Self {
+        if let (Some(_), Some(noise)) = (self.start.take(), self.from_noise) {
+            let FromNoise { steps, solver, lambda_pg, mend } = noise;
+            self = Self { steps, solver, lambda_pg, mend, ..self };
+        }
+        self
+    }
+
+    /// How samples from pure noise are mended: see [`mend`](Self::mend); none if they are not.
+    pub fn mending(&self) -> Option<Self> {
+        let start = StartConfig { time: 0.0, noise: 0.0, ..StartConfig::default() };
+        let held = Self { steps: self.mend, solver: Solver::Hold, start: Some(start), lambda_pg: 0.0, ..self.clone() };
+        (self.mend > 0 && self.start.is_none()).then_some(held)
+    }
+
+    /// Refuses impossible values.
+    pub fn validate(&self) -> Result<(), FlowError> {
+        let bad = |field: &str, expected: &str, found: String| {
+            Err(Invalid::new(format!("sample.{field}"), expected, found).into())
+        };
+        if !(1..=10_000).contains(&self.steps) {
+            return bad("steps", "1 to 10000", self.steps.to_string());
+        }
+        if self.depth.is_some_and(|d| !(1..=20).contains(&d)) {
+            return bad("depth", "1 to 20", format!("{:?}", self.depth));
+        }
+        if self.mend > 10_000 {
+            return bad("mend", "0 to 10000", self.mend.to_string());
+        }
+        if self.refine > 100_000 {
+            return bad("refine", "0 to 100000", self.refine.to_string());
+        }
+        if !(1..=64).contains(&self.ensemble) {
+            return bad("ensemble", "1 to 64", self.ensemble.to_string());
+        }
+        if self.solver == Solver::Hold && self.start.is_none() {
+            return bad("solver", "euler, heun or multistep without sample.start", "hold".into());
+        }
+        if let Some(start) = &self.start {
+            if !(0.0..1.0).contains(&start.time) {
+                return bad("start.time", "0 to below 1", start.time.to_string());
+            }
+            if !(0.0..=2.0).contains(&start.noise) {
+                return bad("start.noise", "0 to 2", start.noise.to_string());
+            }
+            start.fit.check().map_err(|e| Invalid::new("sample.start.fit", "settings of a quick fit", e))?;
+        }
+        if !self.cfg_scale.is_finite() || self.cfg_scale < 0.0 {
+            return bad("cfg_scale", "a finite number, 0 or more", self.cfg_scale.to_string());
+        }
+        if !self.lambda_pg.is_finite() || self.lambda_pg < 0.0 {
+            return bad("lambda_pg", "a finite number, 0 or more", self.lambda_pg.to_string());
+        }
+        if !(1..=1000).contains(&self.photometric_repeats) {
+            return bad("photometric_repeats", "1 to 1000", self.photometric_repeats.to_string());
+        }
+        for (field, size) in [("gradient_size", Some(self.gradient_size)), ("photometric_size", self.photometric_size)]
+        {
+            if let Some(size) = size.filter(|s| !(8..=4096).contains(s)) {
+                return bad(field, "8 to 4096 pixels", size.to_string());
+            }
+        }
+        Ok(())
+    }
+}
+
+/// A start from a quick fit of the input views.
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct StartConfig {
+    /// The time to which the fit is mixed with noise, and from which the flow is integrated; 0: noise alone, in the order of
+    /// the fit.
+    pub time: f32,
+    /// Factor on the noise.
+    pub noise: f32,
+    /// How the fit is made: as in training.
+    pub fit: QuickFitConfig,
+}
+
+impl Default for StartConfig {
+    fn default() -> Self {
+        Self { time: 0.3, noise: 1.0, fit: QuickFitConfig::default() }
+    }
+}
+
+/// Where the photometric gradient that is fed to the network is taken.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum GradientAt {
+    /// At the noisy sample itself, rendered as Gaussians.
+    #[default]
+    Noisy,
+    /// At the estimate of the clean sample: the network's in the previous step, at first the quick fit that sampling starts
+    /// from; at the noisy sample where there is none.
+    Estimate,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn old_names_are_read_and_new_ones_written() {
+        let old = serde_json::json!({ "guidance": 1.5, "photometric": 0.25, "from_noise":
+            { "steps": 3, "solver": "euler", "photometric": 0.5 } });
+        let found: SampleConfig = serde_json::from_value(old).unwrap();
+        assert_eq!((found.cfg_scale, found.lambda_pg, found.from_noise.unwrap().lambda_pg), (1.5, 0.25, 0.5));
+        let new = serde_json::to_value(&found).unwrap();
+        assert_eq!((&new["cfg_scale"], &new["lambda_pg"]), (&1.5.into(), &0.25.into()));
+        assert!(new.get("guidance").is_none() && new.get("photometric").is_none());
+        assert_eq!(serde_json::from_value::<SampleConfig>(new).unwrap(), found);
+    }
+
+    #[test]
+    fn a_model_of_fits_starts_from_noise_in_its_own_way() {
+        let noise = FromNoise { steps: 30, solver: Solver::Multistep, lambda_pg: 0.2, mend: 3 };
+        let fit = SampleConfig {
+            steps: 4,
+            solver: Solver::Hold,
+            start: Some(StartConfig::default()),
+            lambda_pg: 0.0,
+            from_noise: Some(noise),
+            ..SampleConfig::default()
+        };
+        fit.validate().unwrap();
+        let found = fit.clone().without_start();
+        found.validate().unwrap();
+        assert_eq!((found.steps, found.solver, found.lambda_pg), (30, Solver::Multistep, 0.2));
+        assert!(found.start.is_none());
+        // What comes of it takes the place of a fit; what starts from a fit has no need.
+        let mending = found.mending().unwrap();
+        mending.validate().unwrap();
+        assert_eq!((mending.steps, mending.solver, mending.lambda_pg), (3, Solver::Hold, 0.0));
+        assert!(mending.start.is_some_and(|start| start.time == 0.0 && start.noise == 0.0));
+        assert!(fit.mending().is_none());
+        assert_eq!(found.clone().without_start(), found);
+        let held = SampleConfig { from_noise: None, ..fit }.without_start();
+        let message = held.validate().unwrap_err().to_string();
+        assert!(message.contains("sample.solver") && message.contains("hold"), "{message}");
+    }
+}

@@ -1,0 +1,102 @@
+//! Views in the canonical frame, and the quick fits that put them there more exactly.
+
+use std::ops::ControlFlow;
+
+use freerange_camera::{CanonicalFrame, FrameConfig, Similarity, View};
+use freerange_fit::{FitProgress, QuickFitConfig, frame_of, quick_fit};
+use freerange_splat::Cloud;
+
+use crate::{
+    Error, Progress, Stage,
+    progress::Known,
+    reconstructor::{choose_views, moved, to_canonical},
+};
+
+/// The views of an object, and those of them that the model is shown.
+pub(crate) struct Placed {
+    pub frame: CanonicalFrame,
+    /// All of them, in the canonical frame.
+    pub canonical: Vec<View>,
+    /// Which of them the model is shown, ascending.
+    pub chosen: Vec<usize>,
+    /// These, in the canonical frame.
+    pub shown: Vec<View>,
+}
+
+impl Placed {
+    /// At most `most` views are shown.
+    pub fn new(views: &[View], config: &FrameConfig, most: usize) -> Result<Self, Error> {
+        let (mut frame, canonical) = to_canonical(views, config)?;
+        let chosen = choose_views(views, most)?;
+        if chosen.len() < views.len() {
+            let names: Vec<&str> = chosen.iter().map(|&i| views[i].name.as_str()).collect();
+            let (shown, all) = (chosen.len(), views.len());
+            frame.notes.push(format!("the model is shown {shown} of {all} views: {}", names.join(", ")));
+        }
+        let shown: Vec<View> = chosen.iter().map(|&i| canonical[i].clone()).collect();
+        let uneven = shown.iter().filter(|v| v.image.width() != v.image.height()).count();
+        if uneven > 0 {
+            let all = shown.len();
+            frame
+                .notes
+                .push(format!("{uneven} of {all} views are not square: the model is shown squares, cut or padded"));
+        }
+        Ok(Self { frame, canonical, chosen, shown })
+    }
+
+    /// A quick fit for each member of an ensemble. The first one moves frame and views.
+    pub fn quick_fits(
+        &mut self,
+        config: &QuickFitConfig,
+        members: usize,
+        tell: &mut impl FnMut(&Progress<'_>) -> Result<(), Error>,
+    ) -> Result<Vec<Cloud>, Error> {
+        let mut fits = Vec::with_capacity(members);
+        for member in 0..members {
+            let done = [member * config.iterations, members * config.iterations];
+            let seed = member as u64;
+            // The other members only help the first: nobody is shown them.
+            let place = (member == 0).then_some(&self.frame.canonical_from_user);
+            let mut fit = watched(Stage::Fit, 0, place, tell, done, |p| quick_fit(&self.shown, config, seed, p))?;
+            // The fit knows better than the masks where the object is; it moves along, so that one is enough.
+            if member == 0 && !self.frame.kept {
+                let correction = frame_of(&fit, &self.shown)?;
+                fit.transform(correction.scale, correction.rotation, correction.translation);
+                self.correct(&correction);
+            }
+            fits.push(fit);
+        }
+        Ok(fits)
+    }
+
+    fn correct(&mut self, correction: &Similarity) {
+        self.canonical = moved(&self.canonical, correction);
+        self.shown = moved(&self.shown, correction);
+        self.frame.canonical_from_user = correction.after(&self.frame.canonical_from_user);
+        let (shift, scale) = (correction.translation.length(), correction.scale);
+        self.frame.notes.push(format!("the quick fit moved it by {shift:.3} and scaled it by {scale:.3}"));
+    }
+}
+
+/// A fit whose steps are told, as those after so many of so many; what it has when it is stopped is of no use.
+pub(crate) fn watched(
+    stage: Stage,
+    sample: usize,
+    canonical_from_user: Option<&Similarity>,
+    tell: &mut impl FnMut(&Progress<'_>) -> Result<(), Error>,
+    [before, total]: [usize; 2],
+    fit: impl FnOnce(&mut dyn FnMut(&FitProgress<'_>) -> ControlFlow<()>) -> Result<Cloud, freerange_fit::FitError>,
+) -> Result<Cloud, Error> {
+    if before == 0 {
+        tell(&Progress { sample, ..Progress::new(stage, 0, total) })?;
+    }
+    let mut stopped = Ok(());
+    let cloud = fit(&mut |p| {
+        let estimate = canonical_from_user.map(|place| (Known::Fitted(p.cloud), place));
+        let loss = Some(p.loss);
+        stopped = tell(&Progress { sample, loss, estimate, ..Progress::new(stage, before + p.step, total) });
+        if stopped.is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+    });
+    stopped?;
+    Ok(cloud?)
+}
