@@ -4,7 +4,7 @@
 #
 #     tools/python/run.sh target/release/freerange [FEATURES]
 #
-# FEATURES of the build: `as-tests` lets it use what the workspace's tests have built. TORCH=no leaves out PyTorch (3 GB) and what needs it, RERUN=no Rerun.
+# FEATURES of the build: `as-tests` lets it use what the workspace's tests have built, with the same CARGO_OPTIONS. TORCH=no leaves out PyTorch (3 GB) and what needs it, RERUN=no Rerun.
 set -euo pipefail
 FREERANGE=$(realpath "$1")
 export FREERANGE
@@ -24,7 +24,7 @@ pip() { "$folder/venv/bin/pip" --disable-pip-version-check "$@"; }
 export VK_DRIVER_FILES=/nonexistent VK_ICD_FILENAMES=/nonexistent __EGL_VENDOR_LIBRARY_FILENAMES=/nonexistent
 export CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-$PWD/target}
 begin=$SECONDS
-pip install -q './python[test]' ${features:+--config-settings="build-args=--features $features"}
+pip install -q './python[test]' ${features:+--config-settings="build-args=${CARGO_OPTIONS:-} --features $features"}
 echo "installed in $((SECONDS - begin)) s: $(cd / && "$folder/venv/bin/python" -c 'import freerange; print(freerange.__version__, freerange.__file__)')"
 without=()
 if [ "${TORCH:-yes}" = no ] || ! pip install -q torch; then

@@ -5,7 +5,8 @@
 #
 #     tools/ranks/run.sh [FEATURES] [KILLS]
 #
-# FEATURES: those the other programs are built with, so that nothing but our own crates is built again. KILLS: 1, or more to be sure.
+# FEATURES: those the other programs are built with, so that nothing but our own crates is built again;
+# CARGO_OPTIONS likewise. KILLS: 1, or more to be sure.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 features=${1:+$1,}freerange-cli/mpi
@@ -19,7 +20,8 @@ place=$(mktemp -d)
 trap 'rm -rf "$place"' EXIT
 for library in mpich ompi; do
   # The whole workspace, as the tests are: a selection of packages would compile dependencies with other features.
-  MPI_PKG_CONFIG=$library cargo build --workspace --release --features "$features"
+  # shellcheck disable=SC2086
+  MPI_PKG_CONFIG=$library cargo build --workspace --release ${CARGO_OPTIONS:-} --features "$features"
   case $library in
     mpich) launch=(mpirun.mpich) ;;
     # Slots, root, cores: this is one machine with as many processes as we like.
