@@ -39,7 +39,9 @@ def main():
     labels = []  # at the right, moved apart where they would touch
     for key, colour in COLOURS.items():
         points = sorted(data["points"], key=lambda p: p["samples"])
-        line = " ".join(f"{x(p['samples']):.1f},{y(p[key]):.1f}" for p in points)
+        # What was tried and led nowhere (`aside`) has a point, and no line.
+        kept = [p for p in points if not p.get("aside")]
+        line = " ".join(f"{x(p['samples']):.1f},{y(p[key]):.1f}" for p in kept)
         out.append(f'<polyline points="{line}" fill="none" stroke="{colour}" stroke-width="2"/>')
         out += [f'<circle cx="{x(p["samples"]):.1f}" cy="{y(p[key]):.1f}" r="{5 if p.get("shipped") else 3}" fill="{colour}"/>' for p in points]
         out.append(f'<path d="M{LEFT} {y(data["fit"][key]):.1f}H{WIDTH - RIGHT}" stroke="{colour}" stroke-dasharray="5 4"/>')
