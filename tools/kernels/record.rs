@@ -47,6 +47,7 @@ pub fn record(kernel: &dyn CubeKernel) {
     }
     // As a card with a current driver answers.
     let vulkan = VulkanCompilationOptions {
+        supports_explicit_smem: true,
         supports_uniform_standard_layout: true,
         max_spirv_version: (1, 6),
         max_vector_size: 4,

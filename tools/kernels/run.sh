@@ -8,6 +8,7 @@
 # FOLDER: where kernels and report.json go. Wants Rust, Python, pip; builds what uses cubecl-wgpu again, into target/kernels.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
+rm -rf "$1/kernels"
 mkdir -p "$1/kernels"
 folder=$(realpath "$1")
 here=$PWD/tools/kernels
@@ -26,6 +27,9 @@ cp Cargo.lock "$folder/Cargo.lock"
 trap 'cp "$folder/Cargo.lock" Cargo.lock' EXIT
 features=freerange-cli/webgpu,freerange-cli/fetch,freerange-cli/cloud
 export FREERANGE_KERNELS=$folder/kernels CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-target/kernels}
+# The whole workspace, as all tests are (a selection would compile dependencies with other features), and then only what launches kernels.
 # shellcheck disable=SC2086
-cargo test --workspace --release ${CARGO_OPTIONS:-} --features "$features" --config "patch.crates-io.cubecl-wgpu.path=\"$folder/cubecl-wgpu\"" --lib --tests -- gpu
+cargo test --workspace --release ${CARGO_OPTIONS:-} --features "$features" --config "patch.crates-io.cubecl-wgpu.path=\"$folder/cubecl-wgpu\"" \
+  --lib --test gpu --no-run --message-format=json-render-diagnostics >"$folder/build.json"
+python3 "$here/run_tests.py" "$folder/build.json"
 "$folder/venv/bin/python" "$here/check.py" "$folder/kernels" "$folder/report.json"

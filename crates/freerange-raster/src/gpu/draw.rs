@@ -144,14 +144,15 @@ pub fn forward(
         let mut hits = Shared::<[u32]>::new_slice(THREADS);
         let mut splats = Shared::<[F4]>::new_slice(THREADS * RECORD);
         let mut scratch = Shared::<[u32]>::new_slice(SCRATCH);
-        let closed = Shared::<Atomic<u32>>::new();
+        // A slice of one: CubeCL 0.11 cannot write a single shared atomic as SPIR-V.
+        let closed = Shared::<[Atomic<u32>]>::new_slice(1usize);
         if UNIT_POS == 0 {
-            closed.store(0u32);
+            closed[0].store(0u32);
         }
         sync_cube();
         let mut open = at.inside;
         if !open {
-            closed.fetch_add(1u32);
+            closed[0].fetch_add(1u32);
         }
         let mut t = 1.0f32;
         let mut red = 0.0f32;
@@ -203,10 +204,10 @@ pub fn forward(
                     i += 1u32;
                 }
                 if was_open && !open {
-                    closed.fetch_add(1u32);
+                    closed[0].fetch_add(1u32);
                 }
                 sync_cube();
-                go_on = closed.load() < THREADS as u32;
+                go_on = closed[0].load() < THREADS as u32;
                 batch += THREADS as u32;
             }
             first_word += THREADS as u32;

@@ -53,7 +53,8 @@ pub fn sort_blocks(
                     let index_high = index[high];
                     let after = key_low > key_high || (key_low == key_high && index_low > index_high);
                     let ascending = (low & size) == 0usize;
-                    if after == ascending {
+                    // `after == ascending`, which CubeCL 0.11 cannot write as CUDA C++ or SPIR-V.
+                    if (after && ascending) || (!after && !ascending) {
                         key[low] = key_high;
                         key[high] = key_low;
                         index[low] = index_high;
