@@ -134,7 +134,9 @@ def test_an_exception_in_on_step_ends_the_work(model):
 def test_ctrl_c_ends_the_work(tmp_path):
     """In a program of its own, interrupted when it is in the middle."""
     code = (
-        "import freerange, sys, time\n"
+        "import freerange, signal, sys\n"
+        # What is started in the background inherits that interrupts are ignored.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "model = freerange.load(device='cpu')\n"
         "scene = freerange.Scene.read(sys.argv[1])\n"
         "print('begin', flush=True)\n"

@@ -28,6 +28,6 @@ for library in mpich ompi; do
     ompi) launch=(mpirun.openmpi --oversubscribe --allow-run-as-root --bind-to none) ;;
   esac
   echo "== ranks with $library"
-  cp target/release/freerange "$place/freerange-$library"
+  cp "${CARGO_TARGET_DIR:-target}/release/freerange" "$place/freerange-$library"
   python3 tools/ranks/check.py "$place/freerange-$library" "$place/$library" "$kills" "${launch[@]}"
 done
