@@ -33,7 +33,7 @@ pub struct StepReport {
     /// Seconds that this rank of several spent on the sum, its wait for the slowest included.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sum_seconds: Option<f64>,
-    /// Whether [`Trainer::stop_when`] said so, on any rank.
+    /// Whether [`Trainer::stop_when`](super::Trainer::stop_when) said so, on any rank.
     #[serde(skip)]
     pub stop: bool,
 }
