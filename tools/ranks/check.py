@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -142,6 +143,57 @@ assert difference <= TOLERANCE
 done = subprocess.run(command(short, place / "three", 3), capture_output=True, text=True, env=environment, timeout=60)
 assert "data.lanes: expected a multiple of the number of ranks, 3, found 4" in done.stderr, done.stderr
 assert done.returncode == 2 and done.stderr.count("data.lanes") == 1, (done.returncode, done.stderr)
+
+# Evaluation and many scenes: the same of each object, whoever measured it, and one report.
+objects = ["eval", "--generated", "3", "--generated-size", "32", "--pictures", "none", "--refine", "10", "--ensemble", "1"]
+objects += ["--checkpoint", alone / "checkpoint.safetensors"]
+bowl = Path(__file__).resolve().parents[2] / "examples" / "bowl"
+names = ["first", "second", "third"]
+for name in names:
+    shutil.copytree(bowl, place / "scenes" / name)
+(place / "scenes.txt").write_text("".join(f"scenes/{name}\n" for name in [*names[:2], "missing", names[2]]))
+scenes = ["reconstruct", "--list", place / "scenes.txt", "--refine", "10", "--ensemble", "1"]
+scenes += ["--checkpoint", alone / "checkpoint.safetensors"]
+
+
+def shared(arguments, output, ranks, code):
+    """What a command that shares a list leaves, under the launcher or without it."""
+    begin = [*launcher, "-n", str(ranks)] if ranks else []
+    whole = [*begin, program, *arguments, "-o", output]
+    done = subprocess.run(whole, capture_output=True, text=True, env=environment, timeout=300)
+    assert done.returncode == code, (ranks, done.returncode, done.stdout, done.stderr)
+    return done
+
+
+def measured(output):
+    """Each object's numbers, as its own file and as the report have them."""
+    files = sorted((output / "objects").glob("*.json"))
+    records = [json.loads(file.read_text()) for file in files]
+    # Seconds and memory are what differs.
+    kept = ["metrics", "inputs", "validation_sha256", "samples"]
+    report = json.loads((output / "report.json").read_text())
+    return [(r["case"], [r["outcome"][k] for k in kept]) for r in records], [g["metrics"] for g in report["groups"]]
+
+
+shared(objects, place / "eval-0", 0, 0)
+shared(scenes, place / "scenes-0", 0, 2)
+made = [(place / "scenes-0" / name / "gaussians.ply").read_bytes() for name in names]
+for ranks in [1, 2, 4]:
+    output = place / f"eval-{ranks}"
+    done = shared(objects, output, ranks, 0)
+    assert measured(output) == measured(place / "eval-0"), ranks
+    assert len(measured(output)[0]) == 6 and done.stdout.count("report.html") == 1, done.stdout
+    # One of the four scenes is not there: it is named once, and the rest are made.
+    output = place / f"scenes-{ranks}"
+    done = shared(scenes, output, ranks, 2)
+    rows = json.loads((output / "scenes.json").read_text())
+    assert [row["scene"] for row in rows] == [*names[:2], "missing", names[2]], rows
+    assert [bool(row.get("error")) for row in rows] == [False, False, True, False], rows
+    assert [(output / name / "gaussians.ply").read_bytes() for name in names] == made, ranks
+    # Again: nothing is left to do but to say what is there, and what is missing.
+    again = shared(scenes, output, ranks, 2)
+    assert "1 of 4 scenes failed: missing" in again.stderr, again.stderr
+say("3 objects evaluated and 3 scenes made by 1, 2 and 4 ranks", "as by one process, to the bit")
 
 # Kills.
 long = place / "long.toml"
