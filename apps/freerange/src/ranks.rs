@@ -18,6 +18,17 @@ pub struct Job {
     local: [usize; 2],
 }
 
+/// How tensors of gradients are summed over ranks.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum Sums {
+    /// Through the host's memory and MPI, whatever the device.
+    #[default]
+    Host,
+    /// From card to card through NCCL; all else through MPI. Experimental: no card has run it yet. Needs a build with
+    /// `--features nccl`.
+    Nccl,
+}
+
 /// What a rank tells the others of its machine.
 #[derive(serde::Serialize, serde::Deserialize)]
 struct Place {
@@ -86,6 +97,31 @@ impl Job {
         match (device, self.local) {
             (DeviceName::Auto, [local, locals]) if locals > 1 => Ok(DeviceName::auto_of(local)),
             _ => Ok(device.open()?),
+        }
+    }
+
+    /// The ranks, with sums of what is on `device` made in this way. All ranks have to call it.
+    ///
+    /// # Errors
+    /// Where NCCL is asked for and cannot be used, on any rank.
+    pub fn sums(&self, how: Sums, device: &Device) -> Result<Rc<dyn Ranks>, CliError> {
+        match how {
+            Sums::Host => Ok(self.ranks.clone()),
+            #[cfg(feature = "nccl")]
+            Sums::Nccl => self.together(
+                freerange_nccl::Nccl::join(self.ranks.clone(), device)
+                    .map(|nccl| Rc::new(nccl) as Rc<dyn Ranks>)
+                    .map_err(|e| match e {
+                        FlowError::Ranks { problem } => CliError::input(problem),
+                        other => other.into(),
+                    }),
+            ),
+            #[cfg(not(feature = "nccl"))]
+            Sums::Nccl => {
+                let _ = device;
+                let text = "--sums nccl: expected a program built with `--features nccl`, found one built without";
+                self.together(Err(CliError::input(text)))
+            }
         }
     }
 

@@ -56,6 +56,7 @@ const ROOMS: &[(&str, &[&str])] = &[
     ),
     // Apart from the training it serves, so that an MPI library can be changed without compiling that again.
     ("freerange-mpi", &["freerange-flow"]),
+    ("freerange-nccl", &["freerange-flow"]),
     (
         "freerange",
         &[

@@ -25,7 +25,7 @@ use freerange_model::{Compute, Execution, FreeRange, ModelConfig, ModelInfo, Wor
 use crate::{
     error::CliError,
     progress::Progress,
-    ranks::Job,
+    ranks::{Job, Sums},
     runtime::{TrainConfig, commit, local_or_shipped},
     signals::{EXIT_CODE, Signals},
 };
@@ -66,6 +66,9 @@ pub struct Args {
     /// Where to compute: auto, cpu, or cuda, metal, vulkan, webgpu with a number if there are several, as in cuda:1.
     #[arg(long, default_value = "auto")]
     device: DeviceName,
+    /// How several processes add up their gradients.
+    #[arg(long, value_enum, default_value_t)]
+    sums: Sums,
 }
 
 pub fn run(args: &Args) -> Result<(), CliError> {
@@ -99,6 +102,7 @@ fn train(args: &Args, job: &Job, interrupt: &Arc<Interrupt>, begin: Instant) -> 
     if config.optimizer.compute == Compute::Auto {
         say(&format!("computing in {}", config.optimizer.compute.on(&device)));
     }
+    let ranks = job.sums(args.sums, &device)?;
     let total = config.total_steps();
     let encoders = EncoderPlaces::at(args.encoder_weights.clone());
     let weights = || {
@@ -113,7 +117,7 @@ fn train(args: &Args, job: &Job, interrupt: &Arc<Interrupt>, begin: Instant) -> 
     };
     let (encoder, initial, identity) = job.together(weights())?;
     let initial = initial.as_ref().map(|checkpoint| Initial { checkpoint, remeasure: args.remeasure });
-    let among = Among { ranks: job.ranks.clone(), identity };
+    let among = Among { ranks, identity };
     let trainer = Trainer::open_among(among, config, output, initial, encoder.as_ref(), &device, say);
     let mut trainer = job.together(trainer.map_err(CliError::from))?;
     let allowed = args.minutes.and_then(|minutes| Duration::try_from_secs_f64(60.0 * minutes.max(0.0)).ok());

@@ -8,7 +8,7 @@ mod whole;
 use freerange::{Compute, Device, DeviceName, devices, require};
 use serde::Serialize;
 
-use crate::{commands::reconstruct::parse_compute, error::CliError, runtime};
+use crate::{commands::reconstruct::parse_compute, error::CliError, ranks::Sums, runtime};
 
 /// Measure speed on a device: the rasteriser, a transformer block, sampling, training.
 ///
@@ -19,6 +19,9 @@ pub struct Args {
     /// Where to compute: see `freerange devices`.
     #[arg(long, default_value = "auto")]
     device: DeviceName,
+    /// With --only sum: how processes add up.
+    #[arg(long, value_enum, default_value_t)]
+    sums: Sums,
     /// What to measure.
     #[arg(long, value_enum, value_delimiter = ',', default_values_t = Part::ALL)]
     only: Vec<Part>,

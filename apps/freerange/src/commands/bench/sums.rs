@@ -1,7 +1,7 @@
 //! Sums over the processes of a launcher.
 
 use burn::tensor::{Device, Distribution, Tensor};
-use freerange_flow::ranks::{Wire, gather};
+use freerange_flow::ranks::{Ranks, Wire, gather};
 use freerange_model::{ModelInfo, Workload};
 
 use super::{Args, Part, Printer, timer::Timer};
@@ -21,6 +21,7 @@ fn measure(args: &Args, job: &Job) -> Result<(), CliError> {
     }
     let sizes = if args.sizes.is_empty() { vec!["tiny".to_owned(), "base".into()] } else { args.sizes.clone() };
     let device = job.together(job.open(args.device))?;
+    let ranks = job.sums(args.sums, &device)?;
     let counts = sizes.iter().map(|size| Ok((size.as_str(), numbers(size)?))).collect::<Result<Vec<_>, CliError>>();
     let out = Printer { quiet: !job.first() };
     let hardware = freerange::machine::processor();
@@ -34,7 +35,7 @@ fn measure(args: &Args, job: &Job) -> Result<(), CliError> {
     out.header(&["size", "numbers", "wire", "MB", "ms"]);
     for (size, count) in job.together(counts)? {
         for (wire, name, bytes) in [(Wire::F32, "f32", 4), (Wire::Bf16, "bf16", 2)] {
-            let seconds = seconds(job, count, wire, &device, args.seconds)?;
+            let seconds = seconds(&*ranks, count, wire, &device, args.seconds)?;
             let cells = [
                 size.to_owned(),
                 count.to_string(),
@@ -56,15 +57,15 @@ fn numbers(size: &str) -> Result<usize, CliError> {
 }
 
 /// Median seconds of a sum, the same number of times on all ranks, which begin each time together.
-fn seconds(job: &Job, count: usize, wire: Wire, device: &Device, wanted: f64) -> Result<f64, CliError> {
+fn seconds(ranks: &dyn Ranks, count: usize, wire: Wire, device: &Device, wanted: f64) -> Result<f64, CliError> {
     let own = Tensor::<1>::random([count], Distribution::Default, device);
     let timer = Timer { device: device.clone(), seconds: wanted };
     let once = || {
         let flat = own.clone() + 0.0; // a copy: what comes of a backward pass is nobody else's either
         timer.wait()?;
-        gather(&*job.ranks, &[])?;
+        gather(ranks, &[])?;
         let begin = std::time::Instant::now();
-        let sum = job.ranks.sum(flat, wire)?;
+        let sum = ranks.sum(flat, wire)?;
         timer.wait()?;
         drop(sum);
         Ok::<_, CliError>(begin.elapsed().as_secs_f64())
@@ -72,7 +73,7 @@ fn seconds(job: &Job, count: usize, wire: Wire, device: &Device, wanted: f64) ->
     let first = once()?.max(once()?);
     let rounds = ((wanted / first) as u16).clamp(3, 100);
     // As many as rank 0 thinks fit.
-    let rounds = gather(&*job.ranks, &rounds.to_le_bytes())?.swap_remove(0);
+    let rounds = gather(ranks, &rounds.to_le_bytes())?.swap_remove(0);
     let rounds = u16::from_le_bytes([rounds[0], rounds[1]]);
     let mut times = (0..rounds).map(|_| once()).collect::<Result<Vec<f64>, _>>()?;
     times.sort_by(f64::total_cmp);
