@@ -81,6 +81,26 @@ fn outcome(run: &Path) -> (Vec<u8>, Vec<u8>, Vec<serde_json::Value>) {
 }
 
 #[test]
+fn sums_between_cards_are_refused_where_they_cannot_be_made() {
+    let place = tempfile::tempdir().unwrap();
+    let (config, run) = (place.path().join("train.toml"), place.path().join("run"));
+    fs::write(&config, CONFIG).unwrap();
+    let done = Command::new(env!("CARGO_BIN_EXE_freerange"))
+        .args(["train".as_ref(), config.as_os_str(), "-o".as_ref(), run.as_os_str()])
+        .args(["--sums", "nccl", "--device", "cpu"])
+        .output()
+        .unwrap();
+    let error = String::from_utf8_lossy(&done.stderr);
+    let expected = if cfg!(feature = "nccl") {
+        "expected a CUDA device"
+    } else {
+        "expected a program built with `--features nccl`"
+    };
+    assert!(done.status.code() == Some(2) && error.contains(expected), "{error}");
+    assert!(!run.exists());
+}
+
+#[test]
 fn killed_at_ten_points_it_learns_what_it_would_have() {
     let place = tempfile::tempdir().unwrap();
     let path = |name: &str| -> PathBuf { place.path().join(name) };
