@@ -18,7 +18,7 @@ const ROOMS: &[(&str, &[&str])] = &[
     ("freerange-hub", &["freerange-core"]),
     ("freerange-raster", &["freerange-camera"]),
     ("freerange-model", &["freerange-core", "freerange-splat"]),
-    ("freerange-metrics", &["freerange-model"]),
+    ("freerange-metrics", &["freerange-core", "freerange-model"]),
     ("freerange-mesh", &["freerange-core"]),
     ("freerange-render", &["freerange-core", "freerange-camera", "freerange-mesh"]),
     ("freerange-generate", &["freerange-core", "freerange-mesh"]),

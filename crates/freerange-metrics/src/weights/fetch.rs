@@ -8,6 +8,7 @@ use std::{
     time::Duration,
 };
 
+use freerange_core::{beside, hex, persist, write_atomically};
 use hf_hub::{
     Repo, RepoType,
     api::sync::{ApiBuilder, ApiError},
@@ -15,7 +16,7 @@ use hf_hub::{
 use sha2::{Digest, Sha256};
 use tempfile::NamedTempFile;
 
-use super::{NOTE, Origin, WeightFile, WeightSet, check, hexadecimal, is_there, members, note_of, set};
+use super::{NOTE, Origin, WeightFile, WeightSet, check, is_there, members, note_of, set};
 use crate::MetricsError;
 
 /// The largest download.
@@ -152,7 +153,7 @@ impl Client<'_> {
         }
         let folder = target.parent().unwrap_or(Path::new("."));
         std::fs::create_dir_all(folder).map_err(|e| MetricsError::io(folder, e))?;
-        let mut file = NamedTempFile::new_in(folder).map_err(|e| MetricsError::io(folder, e))?;
+        let mut file = beside(target).map_err(|e| MetricsError::io(folder, e))?;
         let name = target.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let mut body = response.into_body().into_reader();
         let mut hash = Sha256::new();
@@ -173,7 +174,7 @@ impl Client<'_> {
         }
         match total {
             Some(total) if total != done => Err(fail(format!("cut short: {done} of {total} bytes came"))),
-            _ => Ok((file, hexadecimal(hash))),
+            _ => Ok((file, hex(&hash.finalize()))),
         }
     }
 
@@ -216,7 +217,7 @@ impl Client<'_> {
             let Some(target) = target.filter(|path| path.extension().is_none_or(|e| e != NOTE)) else { continue };
             let parent = target.parent().unwrap_or(folder);
             std::fs::create_dir_all(parent).map_err(|e| MetricsError::io(parent, e))?;
-            let mut out = NamedTempFile::new_in(parent).map_err(|e| MetricsError::io(parent, e))?;
+            let mut out = beside(&target).map_err(|e| MetricsError::io(parent, e))?;
             let n = std::io::copy(&mut (&mut member).take(LARGEST + 1), &mut out)
                 .map_err(|e| fail(format!("`{name}`: {e}")))?;
             if n > LARGEST {
@@ -231,16 +232,14 @@ impl Client<'_> {
 
 /// Gives a complete file its name, and notes its hash beside it.
 fn keep(file: NamedTempFile, target: &Path, sha256: &str) -> Result<(), MetricsError> {
-    let fail = |e: std::io::Error| MetricsError::io(target, e);
-    file.as_file().sync_all().map_err(fail)?;
     let note = note_of(target);
     // The old note goes first: were we stopped in between, the new file would not fit it.
     match std::fs::remove_file(&note) {
         Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(MetricsError::io(&note, e)),
         _ => {}
     }
-    file.persist(target).map_err(|e| fail(e.error))?;
-    std::fs::write(&note, format!("{sha256}\n")).map_err(|e| MetricsError::io(&note, e))
+    persist(file, target).map_err(|e| MetricsError::io(target, e))?;
+    write_atomically(&note, |out| writeln!(out, "{sha256}")).map_err(|e| MetricsError::io(&note, e))
 }
 
 #[cfg(test)]

@@ -7,8 +7,6 @@ use std::{
     sync::{Arc, Mutex},
 };
 
-use sha2::{Digest, Sha256};
-
 use super::*;
 use crate::weights::Weights;
 
@@ -91,9 +89,7 @@ impl Server {
 }
 
 fn sha(bytes: &[u8]) -> String {
-    let mut hash = Sha256::new();
-    hash.update(bytes);
-    hexadecimal(hash)
+    freerange_core::sha256(bytes)
 }
 
 fn set_of(files: Vec<WeightFile>) -> WeightSet {

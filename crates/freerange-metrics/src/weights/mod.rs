@@ -3,12 +3,9 @@
 #[cfg(feature = "fetch")]
 mod fetch;
 
-use std::{
-    io::Read,
-    path::{Path, PathBuf},
-};
+use std::path::{Path, PathBuf};
 
-use sha2::{Digest, Sha256};
+use freerange_core::sha256_of;
 
 use crate::MetricsError;
 #[cfg(feature = "fetch")]
@@ -290,19 +287,8 @@ fn check(path: &Path, published: &str) -> Result<String, MetricsError> {
 }
 
 fn hash_file(path: &Path) -> Result<String, MetricsError> {
-    let mut file = std::fs::File::open(path).map_err(|e| MetricsError::io(path, e))?;
-    let mut hash = Sha256::new();
-    let mut buffer = vec![0; 1 << 20];
-    loop {
-        match file.read(&mut buffer).map_err(|e| MetricsError::io(path, e))? {
-            0 => return Ok(hexadecimal(hash)),
-            n => hash.update(&buffer[..n]),
-        }
-    }
-}
-
-fn hexadecimal(hash: Sha256) -> String {
-    hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+    let fail = |e| MetricsError::io(path, e);
+    sha256_of(&mut std::fs::File::open(path).map_err(fail)?).map_err(fail)
 }
 
 #[cfg(test)]

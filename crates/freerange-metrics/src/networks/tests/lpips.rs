@@ -2,7 +2,6 @@ use std::{collections::HashMap, path::PathBuf};
 
 use burn::tensor::Tensor;
 use freerange_vectors::json_at;
-use sha2::{Digest, Sha256};
 
 use super::{Vectors, close, device, golden, tensor, uniform};
 use crate::{
@@ -85,8 +84,7 @@ fn published_heads_are_read() {
     // As its authors ship it (R. Zhang et al., BSD-2-Clause): the format before PyTorch 1.6, saved on a GPU.
     let path = golden("networks/lpips_alex_v0.1.pth");
     let published = crate::weights::set("lpips-alex").unwrap().files[1].sha256;
-    let hash: String = Sha256::digest(std::fs::read(&path).unwrap()).iter().map(|b| format!("{b:02x}")).collect();
-    assert_eq!(hash, published);
+    assert_eq!(freerange_core::sha256(&std::fs::read(&path).unwrap()), published);
     let mut file = TensorFile::open(&path, None).unwrap();
     let v = Vectors::open(&golden("lpips_alex_procedural_3102.safetensors"));
     for (i, channels) in [64, 192, 384, 256, 256].into_iter().enumerate() {
