@@ -18,7 +18,7 @@ use clap::{Parser, Subcommand};
 /// From as few as four posed images of an object, a diffusion transformer predicts a compact, complete set of 3D
 /// Gaussians by flow matching. Exit codes: 0 done, 1 failed, 2 bad input.
 #[derive(Parser)]
-#[command(version, max_term_width = 100)]
+#[command(name = "freerange", version, max_term_width = 100)]
 struct Cli {
     #[command(subcommand)]
     command: Command,
