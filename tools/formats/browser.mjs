@@ -84,7 +84,16 @@ export async function browser(width, height) {
   const close = async () => {
     const ended = new Promise((done) => chromium.once("exit", done));
     chromium.removeAllListeners("exit");
-    chromium.once("exit", () => rmSync(profile, { recursive: true, force: true, maxRetries: 5, retryDelay: 100 }));
+    // Chromium's own children may write there a little longer: what could not be removed then is removed at the end, or stays.
+    const remove = () => {
+      try {
+        rmSync(profile, { recursive: true, force: true, maxRetries: 5, retryDelay: 100 });
+        return true;
+      } catch {
+        return false;
+      }
+    };
+    chromium.once("exit", () => remove() || process.once("exit", remove));
     chromium.kill();
     await Promise.race([ended, new Promise((done) => setTimeout(done, 3000))]);
   };
