@@ -46,14 +46,15 @@ pub struct SampleConfig {
     pub coupling: Coupling,
     /// Arithmetic of the transformer's blocks.
     pub compute: Compute,
-    /// Steps of 3DGS-MCMC on the input views that follow ([`freerange_fit::refine`]); [`reconstruct`](super::reconstruct) itself takes none.
+    /// Steps of 3DGS-MCMC on the input views that follow ([`freerange_fit::refine`]); [`reconstruct`](super::reconstruct)
+    /// itself takes none.
     pub refine: usize,
     /// How many samples refinement is held at the mean pictures of, each from a fit and noise of its own; what is refined is the
     /// first. [`reconstruct`](super::reconstruct) itself draws what it is asked for.
     #[serde(skip_serializing_if = "is_one")]
     pub ensemble: usize,
-    /// Steps of [`Solver::Hold`] that follow a sample from pure noise, with it in the place of a fit. [`reconstruct`](super::reconstruct) itself
-    /// takes none.
+    /// Steps of [`Solver::Hold`] that follow a sample from pure noise, with it in the place of a fit.
+    /// [`reconstruct`](super::reconstruct) itself takes none.
     #[serde(skip_serializing_if = "is_zero")]
     pub mend: usize,
     /// What is different where a model that starts from fits by itself is asked to start from pure noise; left out: nothing.
