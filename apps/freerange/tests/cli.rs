@@ -279,6 +279,40 @@ fn a_full_disk() {
 }
 
 #[test]
+fn checkpoints_are_averaged_weight_by_weight() {
+    let folder = tempfile::tempdir().unwrap();
+    let place = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let shipped = root().join("checkpoints/tiny.safetensors").to_str().unwrap().to_owned();
+    let weights = |path: &str| {
+        let bytes = std::fs::read(path).unwrap();
+        let length = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+        bytes[8 + length..].to_vec()
+    };
+    let mut bytes = std::fs::read(&shipped).unwrap();
+    let start = bytes.len() - weights(&shipped).len();
+    let depth = bytes[..start].windows(12).position(|w| w == b"\"depth\":\"10\"").expect("1,024 Gaussians");
+    bytes[depth + 10] = b'1';
+    std::fs::write(place("deeper"), &bytes).unwrap();
+    bytes[depth + 10] = b'0';
+    bytes[start..].chunks_exact_mut(2).for_each(|weight| weight[1] ^= 0x80); // the sign of each
+    std::fs::write(place("opposite"), &bytes).unwrap();
+
+    let average = |inputs: &[&str], output: &str| {
+        let done = freerange(&[&["model", "average", "-o", output], inputs].concat());
+        (done.status.code(), String::from_utf8_lossy(&done.stderr).into_owned())
+    };
+    let (nothing, same, small) = (place("nothing"), place("same"), place("small"));
+    assert_eq!(average(&[&shipped, &place("opposite")], &nothing).0, Some(0));
+    assert!(weights(&nothing).iter().all(|&byte| byte == 0));
+    assert_eq!(average(&[&shipped, &shipped], &same).0, Some(0));
+    assert!(freerange(&["model", "shrink", &same, &small]).status.success());
+    assert!(weights(&small) == weights(&shipped));
+    let (code, message) = average(&[&shipped, &place("deeper")], &place("none"));
+    assert!(code == Some(2) && message.contains("deeper") && message.contains("depth"), "{code:?} {message}");
+    assert!(!folder.path().join("none").exists());
+}
+
+#[test]
 fn a_checkpoint_can_be_told_how_to_sample() {
     let folder = tempfile::tempdir().unwrap();
     let (config, output) = (folder.path().join("other.toml"), folder.path().join("other.safetensors"));

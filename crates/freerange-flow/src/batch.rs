@@ -10,7 +10,7 @@ use freerange_camera::{
 };
 use freerange_data::{InputFit, Object};
 use freerange_model::{FreeRange, ModelConfig};
-use freerange_splat::{Normalization, channel};
+use freerange_splat::{Cloud, Normalization, channel};
 use glam::DVec3;
 use rand::{Rng, SeedableRng, seq::SliceRandom};
 use rand_chacha::ChaCha8Rng;
@@ -21,6 +21,7 @@ use crate::{
     config::{FrameJitter, LossConfig, Stage, StartLoss},
     path::{guess_weight, render_weight},
     photometric::{Images, Targets},
+    symmetry::Symmetry,
 };
 
 /// The same view at most `size` pixels wide and high, aspect kept.
@@ -227,10 +228,16 @@ impl Rows {
         rng: &mut ChaCha8Rng,
     ) -> Result<(), FlowError> {
         let &Common { depth, loss, normalization, start, hold, inputs, one_sided } = common;
+        let symmetry = Symmetry::draw(loss.symmetries, rng);
+        let slice = match fit {
+            Some(fit) => &fit.mended,
+            None => object.slice(depth)?,
+        };
+        let order = symmetry.order(fit.map_or(slice, |fit| &fit.gaussians)); // both have it, one by one
+        let seen_so = |cloud: &Cloud| symmetry.gaussians(cloud).select(order.iter().copied());
         let mut slice = match fit {
-            Some(fit) => fit.mended.clone(),
-            None if loss.random_patches => object.slice(depth)?.shuffled(rng),
-            None => object.slice(depth)?.clone(),
+            None if loss.random_patches => seen_so(slice).shuffled(rng),
+            _ => seen_so(slice),
         };
         let values = (1usize << depth) * channel::COUNT;
         let mut epsilon: Vec<f32> = (0..values).map(|_| StandardNormal.sample(rng)).collect();
@@ -250,15 +257,17 @@ impl Rows {
         if frame != Similarity::IDENTITY {
             slice.transform(frame.scale, frame.rotation, frame.translation);
         }
-        let moved =
-            |v: &View| View { camera: v.camera.transformed(&frame), name: v.name.clone(), image: v.image.clone() };
+        let moved = |v: &View| {
+            let v = symmetry.view(v);
+            View { camera: v.camera.transformed(&frame), ..v }
+        };
         self.seen.push(chosen.into_iter().map(moved).collect::<Vec<_>>());
         self.held.push(rest.into_iter().take(loss.held_views).map(moved).collect::<Vec<_>>());
         let clean = normalization.normalize(&slice);
         match fit {
             None => loss.coupling.pair(&mut epsilon, &clean),
             Some(fit) => {
-                let mut guess = fit.gaussians.clone();
+                let mut guess = seen_so(&fit.gaussians);
                 if frame != Similarity::IDENTITY {
                     guess.transform(frame.scale, frame.rotation, frame.translation);
                 }

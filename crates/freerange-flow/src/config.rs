@@ -139,6 +139,9 @@ pub struct LossConfig {
     pub one_sided: f32,
     /// How far the frame that an object is shown in is off its own. A user's frame is estimated from few views.
     pub frame_jitter: FrameJitter,
+    /// Which other objects an object stands for, too: each time it is used, one of them is drawn.
+    #[serde(skip_serializing_if = "Symmetries::none")]
+    pub symmetries: Symmetries,
 }
 
 /// How training starts from quick fits. Such batches have the input views of their fits, and lead to what these should
@@ -186,6 +189,23 @@ pub struct FrameJitter {
     pub center: f32,
 }
 
+/// Changes that turn an object into another one that might as well have been in the data: see
+/// [`Symmetry`](crate::symmetry::Symmetry).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Symmetries {
+    /// Quarter turns about the upright axis, and mirrors that contain it: eight objects of one.
+    pub space: bool,
+    /// Permutations of red, green and blue: six objects of one.
+    pub color: bool,
+}
+
+impl Symmetries {
+    fn none(&self) -> bool {
+        *self == Self::default()
+    }
+}
+
 impl Default for LossConfig {
     fn default() -> Self {
         Self {
@@ -207,6 +227,7 @@ impl Default for LossConfig {
             gradient_at: GradientAt::Noisy,
             one_sided: 0.0,
             frame_jitter: FrameJitter::default(),
+            symmetries: Symmetries::default(),
         }
     }
 }

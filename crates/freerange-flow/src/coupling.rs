@@ -72,7 +72,7 @@ fn longest_axis(rows: &[Row], chosen: &[u32]) -> usize {
 }
 
 /// The axis along which the two halves of a range of Gaussians lie farthest apart: the one the tree split them by.
-fn separating_axis(data: &[f32], first: usize, count: usize) -> usize {
+pub(crate) fn separating_axis(data: &[f32], first: usize, count: usize) -> usize {
     let center = |first: usize, count: usize| {
         let mut sum = [0f32; 3];
         let rows: &[Row] = data.as_chunks().0;

@@ -14,6 +14,7 @@ pub mod path;
 pub mod photometric;
 pub mod ranks;
 pub mod sample;
+pub mod symmetry;
 pub mod train;
 pub mod trainer;
 mod validation;
@@ -21,3 +22,4 @@ mod weights;
 
 pub use error::FlowError;
 pub use validation::{Figures, ValidationConfig};
+pub use weights::average;

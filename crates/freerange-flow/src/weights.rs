@@ -1,11 +1,16 @@
-//! A module's parameters as flat vectors in a fixed order: for moving averages.
+//! A module's parameters as flat vectors in a fixed order: for averages over the steps of a run, and over runs.
+
+use std::path::PathBuf;
 
 use burn::{
     module::{Module, ModuleMapper, ModuleVisitor, Param},
     tensor::Tensor,
 };
-use freerange_core::sha256;
+use freerange_core::{Invalid, sha256};
+use freerange_model::Checkpoint;
 use rayon::prelude::*;
+
+use crate::FlowError;
 
 /// All float parameters of a module, flattened, in the order in which the module visits them.
 #[derive(Clone, Debug)]
@@ -50,4 +55,42 @@ impl Weights {
         }
         module.map(&mut Set(self.0.clone().into_iter()))
     }
+}
+
+/// The mean of checkpoints, weight by weight. Of runs that began with the same trained weights and saw other batches it is
+/// often better than any one of them (Wortsman et al. 2022, "Model soups" and "lo-fi"): training on several machines
+/// that never speak to each other. What else a checkpoint holds is the first one's; its provenance names all files.
+///
+/// # Errors
+/// [`FlowError::Config`] where there is none, or where one differs from the first in its architecture, its tree depth or
+/// in how its Gaussians were normalised; names the file.
+pub fn average(checkpoints: Vec<(PathBuf, Checkpoint)>) -> Result<Checkpoint, FlowError> {
+    let names: Vec<String> = checkpoints.iter().map(|(path, _)| path.display().to_string()).collect();
+    let count = checkpoints.len() as f32;
+    let mut all = checkpoints.into_iter();
+    let Some((_, mut mean)) = all.next() else {
+        return Err(Invalid::new("checkpoints", "at least one", "none").into());
+    };
+    let mut sums = Weights::of(&mean.model).0;
+    let mut squares = mean.gradient_rms.map(|x| x * x);
+    for ((_, other), name) in all.zip(&names[1..]) {
+        let alike = |same: bool, what: &str| match same {
+            true => Ok(()),
+            false => Err(Invalid::new(format!("{name}: {what}"), format!("that of {}", names[0]), "another one")),
+        };
+        alike(other.config.architecture() == mean.config.architecture(), "architecture")?;
+        alike(other.depth == mean.depth, "depth of the tree")?;
+        alike(other.normalization == mean.normalization, "normalisation of Gaussians")?;
+        for (sum, weights) in sums.iter_mut().zip(Weights::of(&other.model).0) {
+            *sum = sum.clone() + weights;
+        }
+        squares.iter_mut().zip(other.gradient_rms).for_each(|(sum, x)| *sum += x * x);
+    }
+    let means = Weights(sums.into_iter().map(|sum| sum / count).collect());
+    mean.model = means.apply(mean.model);
+    mean.gradient_rms = squares.map(|sum| (sum / count).sqrt());
+    if let Some(provenance) = mean.provenance.as_object_mut() {
+        provenance.insert("averaged".into(), names.into());
+    }
+    Ok(mean)
 }

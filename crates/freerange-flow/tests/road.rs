@@ -9,7 +9,7 @@ use freerange_data::ObjectSource;
 use freerange_flow::{
     FlowError,
     batch::{Batch, step_rng},
-    config::FrameJitter,
+    config::{FrameJitter, Symmetries},
     photometric::{Photometric, Targets},
     sample::{Estimate, PhotometricStep, SampleConfig, reconstruct},
     trainer::{Initial, Trainer},
@@ -302,6 +302,37 @@ fn a_moved_frame_changes_nothing_that_is_seen() {
     }
     assert!(shifts.iter().all(|s| s.abs() > 1e-4 && s.abs() <= 0.2 + 1e-5), "{shifts:?}");
     assert!(shifts.iter().any(|s| (s - shifts[0]).abs() > 1e-3), "each draw is another one: {shifts:?}");
+}
+
+#[test]
+fn another_object_of_the_same_data_agrees_with_its_photos() {
+    let plain = config(1);
+    let mut varied = plain.clone();
+    varied.loss.symmetries = Symmetries { space: true, color: true };
+    let device = Device::flex();
+    let source = Generated { config: plain.data.making.object.clone(), depths: vec![6], seed: 5 };
+    let object = Arc::new(source.object(0).unwrap());
+    let normalization = Normalization { mean: [0.0; channel::COUNT], std: [1.0; channel::COUNT] };
+    let photometric = Photometric::new(&normalization, &device);
+    let (mut own, mut others, mut before) = (0.0, 0.0, 0.0);
+    for seed in 0..8 {
+        let draw = |config: &TrainConfig| {
+            let (mut rng, objects) = (step_rng(seed, 0), [object.clone()]);
+            Batch::draw(&objects, &config.stages[0], &config.model, &config.loss, &normalization, &mut rng, &device)
+                .unwrap()
+        };
+        let loss = |batch: &Batch, targets: &Targets| {
+            photometric.l1(batch.data.clone(), targets).unwrap().into_data().try_to_vec::<f32>().unwrap()[0]
+        };
+        let (a, b) = (draw(&plain), draw(&varied));
+        for (of_a, of_b) in [(&a.seen, &b.seen), (a.held.as_ref().unwrap(), b.held.as_ref().unwrap())] {
+            before += loss(&a, of_a);
+            own += loss(&b, of_b);
+            others += loss(&a, of_b);
+        }
+    }
+    assert!((own - before).abs() < 0.2 * before, "{own} {before}");
+    assert!(others > 1.5 * own, "it is another object: {others} {own}");
 }
 
 /// Training at the start, from a fit to what it should have been, and sampling that stays there.

@@ -17,6 +17,9 @@ pub enum Command {
     Info(Info),
     /// Write a checkpoint with weights of 16 bits: half the size, the same results to three digits.
     Shrink(Shrink),
+    /// Write the mean of checkpoints, weight by weight: of runs that began with the same weights, on machines that need not know
+    /// each other, it is often better than any one of them.
+    Average(Average),
     /// Write a folder in the layout of model hubs: weights, configuration and a card.
     Export(super::export::Args),
 }
@@ -59,10 +62,34 @@ pub struct Shrink {
     sampling: Option<PathBuf>,
 }
 
+/// Arguments of `model average`.
+#[derive(clap::Args)]
+pub struct Average {
+    /// Checkpoints to read. What is no weight is the first one's.
+    #[arg(required = true, value_name = "CHECKPOINT")]
+    inputs: Vec<PathBuf>,
+    /// Checkpoint to write.
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    /// Folder of the weights of the checkpoints' frozen encoder: see `freerange reconstruct`.
+    #[arg(long, value_name = "FOLDER")]
+    encoder_weights: Option<PathBuf>,
+}
+
 pub fn run(command: &Command) -> Result<(), CliError> {
     match command {
         Command::Info(args) => info(args),
         Command::Export(args) => super::export::run(args),
+        Command::Average(args) => {
+            let encoders = EncoderPlaces::at(args.encoder_weights.clone());
+            let load = |path: &PathBuf| {
+                let checkpoint =
+                    load_checkpoint(Some(&runtime::local(path)?), &encoders, &burn::tensor::Device::flex())?;
+                Ok((path.clone(), checkpoint))
+            };
+            let all = args.inputs.iter().map(load).collect::<Result<Vec<_>, CliError>>()?;
+            Ok(freerange_flow::average(all)?.save(&args.output)?)
+        }
         Command::Shrink(args) => {
             let encoders = EncoderPlaces::at(args.encoder_weights.clone());
             let mut checkpoint =
