@@ -118,6 +118,7 @@ pub struct Sampling {
     steps: Option<usize>,
     refine: Option<usize>,
     ensemble: Option<usize>,
+    polish: Option<usize>,
     mend: Option<usize>,
     start: Option<String>,
     depth: Option<u32>,
@@ -146,6 +147,7 @@ impl Sampling {
         sample.cfg_scale = self.cfg_scale.unwrap_or(sample.cfg_scale);
         sample.lambda_pg = self.lambda_pg.unwrap_or(sample.lambda_pg);
         sample.refine = self.refine.unwrap_or(sample.refine);
+        sample.polish = self.polish.unwrap_or(sample.polish);
         sample.mend = self.mend.unwrap_or(sample.mend);
         sample.ensemble = self.ensemble.unwrap_or(sample.ensemble);
         if let Some(name) = self.solver {

@@ -96,7 +96,8 @@ def test_masks_alpha_and_floats_tell_the_same(model, bowl):
 
 def test_seeds_are_samples(model, bowl):
     images, intrinsics, c2w = bowl
-    quick = dict(convention="opengl", refine=0, steps=2, start="noise", compute="f32")
+    # Not polished: relocation draws by opacity, and makes of any difference in rounding another sample.
+    quick = dict(convention="opengl", refine=0, steps=2, start="noise", polish=0, compute="f32")
     two = model.reconstruct(images, intrinsics, c2w, seed=[5, 6], **quick)
     assert [g.seed for g in two] == [5, 6]
     assert not np.array_equal(two[0].means, two[1].means)

@@ -30,7 +30,7 @@ struct Cli {
 #[derive(Subcommand)]
 enum Command {
     /// Reconstruct an object from posed images.
-    Reconstruct(commands::reconstruct::Args),
+    Reconstruct(Box<commands::reconstruct::Args>),
     /// Show what is understood of a scene: cameras, masks, place and size, and what may go wrong.
     Inspect(commands::inspect::Args),
     /// Serve a page: drop photos with cameras, mend masks, and watch the Gaussians appear.

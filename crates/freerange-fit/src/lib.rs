@@ -28,7 +28,7 @@ pub use error::FitError;
 pub use fit::fit;
 pub use frame::frame_of;
 pub use quality::{over_white, psnr_over_white, render_over_white};
-pub use quick::{QuickFitConfig, quick_fit, tree_slice};
+pub use quick::{QuickFitConfig, polish, quick_fit, tree_slice};
 pub use refine::refine;
 
 use freerange_splat::Cloud;

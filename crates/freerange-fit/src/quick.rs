@@ -64,6 +64,23 @@ pub fn quick_fit(
     fit(views, None, &config.config(seed), progress)
 }
 
+/// `cloud`, moved by as short a fit of `views`: what a sample needs that the views do not look like. It keeps its
+/// number of Gaussians, whatever `config` says of that.
+///
+/// # Errors
+/// Those of [`fit`].
+pub fn polish(
+    cloud: &Cloud,
+    views: &[View],
+    config: &QuickFitConfig,
+    seed: u64,
+    progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
+) -> Result<Cloud, FitError> {
+    config.check()?;
+    let own = QuickFitConfig { gaussians: cloud.len(), ..config.clone() };
+    fit(views, Some(cloud), &own.config(seed), progress)
+}
+
 /// `cloud` as `2^depth` Gaussians in the order of its level-of-detail tree, axes labelled by the world's: as the network
 /// takes and makes them.
 ///

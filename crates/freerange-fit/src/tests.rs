@@ -136,6 +136,24 @@ fn a_fit_can_start_from_a_cloud_and_stop_early() {
     assert!(psnr(&stopped, &views) > 25.0);
 }
 
+#[test]
+fn polishing_keeps_the_number_and_comes_nearer() {
+    let scene = ball(30, 4);
+    let views = ring(4, 32, &scene);
+    let rough = disturbed(&scene, 9);
+    let mut steps = 0;
+    let config = QuickFitConfig { iterations: 150, gaussians: 7, render_size: 32 };
+    let polished = polish(&rough, &views, &config, 3, |p| {
+        steps = p.steps;
+        ControlFlow::Continue(())
+    })
+    .unwrap();
+    assert_eq!((steps, polished.len()), (150, 30));
+    let [before, after] = [&rough, &polished].map(|cloud| psnr(cloud, &views));
+    assert!(after > before + 2.0, "{before} dB, polished {after} dB");
+    assert!(polish(&Cloud::default(), &views, &config, 3, go).is_err());
+}
+
 /// A cloud as a generator might give it: right on the whole, wrong in detail.
 fn disturbed(cloud: &Cloud, seed: u64) -> Cloud {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);

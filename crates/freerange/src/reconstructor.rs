@@ -4,7 +4,7 @@ use std::{ops::ControlFlow, path::Path, time::Instant};
 
 use burn::tensor::Device;
 use freerange_camera::{CanonicalFrame, FrameConfig, Similarity, View, canonical_from_user, inputs_around};
-use freerange_fit::{FitProgress, HoldConfig, RefineConfig, refine, tree_slice};
+use freerange_fit::{FitProgress, HoldConfig, QuickFitConfig, RefineConfig, polish, refine, tree_slice};
 use freerange_flow::sample::{Estimate, SampleConfig, StartConfig, reconstruct};
 use freerange_model::Checkpoint;
 use freerange_splat::Cloud;
@@ -151,6 +151,11 @@ impl Reconstructor {
             let begin = Instant::now();
             fits = placed.quick_fits(fit, members, &mut tell)?;
             seconds.push((Stage::Fit, begin.elapsed().as_secs_f64()));
+        } else if options.sample.polish > 0 {
+            // What is polished begins elsewhere, but where the object is, a quick fit knows best there, too.
+            let begin = Instant::now();
+            placed.quick_fits(&QuickFitConfig::default(), 1, &mut tell)?;
+            seconds.push((Stage::Fit, begin.elapsed().as_secs_f64()));
         }
 
         let begin = Instant::now();
@@ -214,6 +219,12 @@ impl Reconstructor {
         let fits = fit.map(std::slice::from_ref);
         let sampled = reconstruct(&self.checkpoint, &[views], fits, config, &seeds, &self.device, &mut told)?;
         let mut clouds: Vec<Cloud> = sampled.into_iter().flatten().collect();
+        if config.polish > 0 && config.start.is_none() {
+            let steps = QuickFitConfig { iterations: config.polish, ..QuickFitConfig::default() };
+            for (cloud, &seed) in clouds.iter_mut().zip(&seeds) {
+                *cloud = polish(cloud, views, &steps, seed, |_| ControlFlow::Continue(()))?;
+            }
+        }
         if let Some(mending) = config.mending() {
             for (cloud, seed) in clouds.iter_mut().zip(&seeds) {
                 let (start, seeds) = (std::slice::from_ref(&*cloud), std::slice::from_ref(seed));

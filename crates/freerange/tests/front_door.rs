@@ -130,7 +130,7 @@ fn an_ensemble_holds_the_refinement_of_its_first_member() {
     assert_eq!(alone.canonical_from_user, together.canonical_from_user);
 }
 
-/// From pure noise; what is mended starts from that sample and stays near it.
+/// From pure noise; what is mended or polished starts from that sample and stays near it.
 #[test]
 fn a_sample_from_noise_is_mended() {
     let model = model();
@@ -138,7 +138,7 @@ fn a_sample_from_noise_is_mended() {
     let mut options = short(&model);
     // Rough samples, and a few of them: single ones differ by as much as mending is worth.
     options.seeds = vec![4, 5, 6];
-    options.sample = SampleConfig { steps: 1, mend: 0, refine: 0, ..options.sample.without_start() };
+    options.sample = SampleConfig { steps: 1, polish: 0, mend: 0, refine: 0, ..options.sample.without_start() };
     let quality = |options: &Options| {
         let made = model.run(&views, options, &mut go).unwrap();
         let scores = made.samples.iter().map(|s| score(&s.gaussians, &views).unwrap().unwrap().psnr);
@@ -148,6 +148,10 @@ fn a_sample_from_noise_is_mended() {
     options.sample.mend = 3;
     let after = quality(&options);
     assert!(after > before + 0.5, "{before} dB, mended {after} dB");
+    options.sample.mend = 0;
+    options.sample.polish = 60;
+    let after = quality(&options);
+    assert!(after > before + 1.0, "{before} dB, polished {after} dB");
 }
 
 #[test]
@@ -231,7 +235,7 @@ fn photos_of_any_shape_and_size_are_seen_undistorted() {
     let squares = photos.each_ref().map(|v| Window::around(v).cut(v).into_owned());
     assert_eq!(squares.each_ref().map(|v| v.image.dimensions()), [(512, 512), (512, 512), (300, 300), (512, 512)]);
     let mut options = model.options().unwrap();
-    options.sample = SampleConfig { steps: 4, refine: 0, ..options.sample.without_start() };
+    options.sample = SampleConfig { steps: 4, polish: 0, refine: 0, ..options.sample.without_start() };
     let run = |views: &[View], options: &Options| model.run(views, options, &mut go).unwrap().samples.remove(0);
     // What the network and its guidance see of a photo is what a square camera would have seen.
     assert_eq!(run(&photos, &options).gaussians, run(&squares, &options).gaussians);

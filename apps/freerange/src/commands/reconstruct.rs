@@ -95,6 +95,9 @@ pub struct Sampling {
     /// Hold that refinement at the mean pictures of so many samples; 1 is the sample alone [default: the checkpoint's].
     #[arg(long, value_name = "SAMPLES", value_parser = clap::value_parser!(u8).range(1..=64))]
     pub ensemble: Option<u8>,
+    /// Fit a sample from pure noise to the input views in so many steps before it is mended; 0 is none [default: the checkpoint's].
+    #[arg(long, value_name = "STEPS")]
+    pub polish: Option<usize>,
     /// Mend a sample from pure noise in so many passes, as fits are mended; 0 is none [default: the checkpoint's].
     #[arg(long, value_name = "PASSES")]
     pub mend: Option<usize>,
@@ -188,6 +191,7 @@ impl Sampling {
         sample.solver = self.solver.unwrap_or(sample.solver);
         sample.compute = self.compute.unwrap_or(sample.compute);
         sample.refine = self.refine.unwrap_or(sample.refine);
+        sample.polish = self.polish.unwrap_or(sample.polish);
         sample.mend = self.mend.unwrap_or(sample.mend);
         sample.ensemble = self.ensemble.map_or(sample.ensemble, usize::from);
         options.seeds = (0..u64::from(samples)).map(|i| self.seed.wrapping_add(i)).collect();

@@ -53,6 +53,10 @@ pub struct SampleConfig {
     /// first. [`reconstruct`](super::reconstruct) itself draws what it is asked for.
     #[serde(skip_serializing_if = "is_one")]
     pub ensemble: usize,
+    /// Steps of a [fit](freerange_fit::polish) of the input views, at the size that quick fits have, that follow a sample from pure noise before it is
+    /// [mended](Self::mend). [`reconstruct`](super::reconstruct) itself takes none.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub polish: usize,
     /// Steps of [`Solver::Hold`] that follow a sample from pure noise, with it in the place of a fit.
     /// [`reconstruct`](super::reconstruct) itself takes none.
     #[serde(skip_serializing_if = "is_zero")]
@@ -73,9 +77,18 @@ pub struct FromNoise {
     /// [`SampleConfig::lambda_pg`]
     #[serde(alias = "photometric")]
     pub lambda_pg: f32,
+    /// [`SampleConfig::polish`]; left out: 800, which on generated objects gain 1.1 dB and more (docs/experiments.md).
+    #[serde(default = "FromNoise::polish")]
+    pub polish: usize,
     /// [`SampleConfig::mend`]
     #[serde(default, skip_serializing_if = "is_zero")]
     pub mend: usize,
+}
+
+impl FromNoise {
+    fn polish() -> usize {
+        800
+    }
 }
 
 impl Default for SampleConfig {
@@ -97,6 +110,7 @@ impl Default for SampleConfig {
             compute: Compute::F32,
             refine: 0,
             ensemble: 1,
+            polish: 0,
             mend: 0,
             from_noise: None,
         }
@@ -115,8 +129,8 @@ impl SampleConfig {
     /// The same from pure noise: see [`from_noise`](Self::from_noise).
     pub fn without_start(mut self) -> Self {
         if let (Some(_), Some(noise)) = (self.start.take(), self.from_noise) {
-            let FromNoise { steps, solver, lambda_pg, mend } = noise;
-            self = Self { steps, solver, lambda_pg, mend, ..self };
+            let FromNoise { steps, solver, lambda_pg, polish, mend } = noise;
+            self = Self { steps, solver, lambda_pg, polish, mend, ..self };
         }
         self
     }
@@ -138,6 +152,9 @@ impl SampleConfig {
         }
         if self.depth.is_some_and(|d| !(1..=20).contains(&d)) {
             return bad("depth", "1 to 20", format!("{:?}", self.depth));
+        }
+        if self.polish > 100_000 {
+            return bad("polish", "0 to 100000", self.polish.to_string());
         }
         if self.mend > 10_000 {
             return bad("mend", "0 to 10000", self.mend.to_string());
@@ -228,7 +245,7 @@ mod tests {
 
     #[test]
     fn a_model_of_fits_starts_from_noise_in_its_own_way() {
-        let noise = FromNoise { steps: 30, solver: Solver::Multistep, lambda_pg: 0.2, mend: 3 };
+        let noise = FromNoise { steps: 30, solver: Solver::Multistep, lambda_pg: 0.2, polish: 7, mend: 3 };
         let fit = SampleConfig {
             steps: 4,
             solver: Solver::Hold,
@@ -240,7 +257,7 @@ mod tests {
         fit.validate().unwrap();
         let found = fit.clone().without_start();
         found.validate().unwrap();
-        assert_eq!((found.steps, found.solver, found.lambda_pg), (30, Solver::Multistep, 0.2));
+        assert_eq!((found.steps, found.solver, found.lambda_pg, found.polish), (30, Solver::Multistep, 0.2, 7));
         assert!(found.start.is_none());
         // What comes of it takes the place of a fit; what starts from a fit has no need.
         let mending = found.mending().unwrap();
