@@ -45,7 +45,7 @@ fn cameras(config: &HoldConfig) -> impl Iterator<Item = Camera> + '_ {
 
 impl Hold {
     /// The mean pictures of `clouds`; none where they would have no weight.
-    pub fn new(clouds: &[&Cloud], config: &HoldConfig) -> Result<Self, FitError> {
+    pub fn new(clouds: &[Cloud], config: &HoldConfig) -> Result<Self, FitError> {
         let raster = RasterConfig::default().shrunk(config.size as f32 / FULL_SIZE);
         let pixels = (config.size * config.size) as usize;
         let share = 1.0 / clouds.len() as f32;

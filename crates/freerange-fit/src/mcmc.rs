@@ -31,6 +31,14 @@ pub(crate) fn relocation(opacity: f64, copies: usize) -> (f64, f64) {
     (each.clamp(*OPACITY.start(), *OPACITY.end()), opacity / sum)
 }
 
+/// Makes Gaussian `i` one of `copies` that look together as it does.
+pub(crate) fn split(cloud: &mut Cloud, i: usize, copies: usize) {
+    let (opacity, factor) = relocation(cloud.opacity(i), copies.min(MAX_COPIES));
+    let row = &mut cloud.as_mut_rows()[i];
+    row[channel::LOGIT_OPACITY] = (opacity / (1.0 - opacity)).ln() as f32;
+    row[channel::LOG_SCALE].iter_mut().for_each(|s| *s += factor.ln() as f32);
+}
+
 /// The number of Gaussians after one round of growth; grows to the limit and not beyond.
 pub(crate) fn grown(count: usize, config: &FitConfig) -> usize {
     // Few Gaussians would never grow by rounding down alone.
@@ -62,10 +70,7 @@ fn place(cloud: &mut Cloud, adam: &mut Adam, weights: &[f64], targets: &[usize],
     let sources: Vec<usize> = targets.iter().map(|_| draw.sample(rng)).collect();
     sources.iter().for_each(|&source| copies[source] += 1);
     for (source, &copies) in copies.iter().enumerate().filter(|(_, copies)| **copies > 1) {
-        let (opacity, factor) = relocation(cloud.opacity(source), copies.min(MAX_COPIES));
-        let row = &mut cloud.as_mut_rows()[source];
-        row[channel::LOGIT_OPACITY] = (opacity / (1.0 - opacity)).ln() as f32;
-        row[channel::LOG_SCALE].iter_mut().for_each(|s| *s += factor.ln() as f32);
+        split(cloud, source, copies);
         adam.forget(source);
     }
     for (&target, &source) in targets.iter().zip(&sources) {

@@ -229,7 +229,7 @@ mod tests {
         assert_eq!(targets.groups(&[0, 1, 2]).map(|(group, _)| group.len()).collect::<Vec<_>>(), [2, 1]);
         let mut cloud = ball(12, 3);
         let hold = HoldConfig { weight: 0.5, views: 5, size: 24, ..Default::default() };
-        let hold = Hold::new(&[&ball(12, 2)], &hold).unwrap();
+        let hold = Hold::new(&[ball(12, 2)], &hold).unwrap();
         let value = |cloud: &Cloud| {
             let mut o = Objective::photometric(cloud, &targets, &[0, 2], [0.3, 0.6, 0.1], 0.2).unwrap();
             o.add_opacity(cloud, 0.3);

@@ -4,6 +4,7 @@ use crate::{
     FitError, FitProgress, RefineConfig,
     fit::{checked, next_views, optimise},
     hold::Hold,
+    mcmc::split,
     views::Targets,
 };
 use freerange_camera::View;
@@ -16,9 +17,10 @@ use std::ops::ControlFlow;
 ///
 /// Few views say little of the rest of the object, and Gaussians that only they judge leave the object's surface. Hence a
 /// [`Hold`](crate::HoldConfig): at every step, a picture of the cloud as it was, from somewhere around the object, is one
-/// more view to agree with, though less. `others` are more clouds of the same object, of which nothing is kept but that these
-/// pictures are the mean of all: where guesses differ, their mean is nearer to the truth than most. `progress` hears of every step, and ends with what there is by
-/// `ControlFlow::Break`. The same input gives the same bytes.
+/// more view to agree with, though less. `others` are more clouds of the same object. These pictures are the mean of all:
+/// where guesses differ, their mean is nearer to the truth than most. For the same reason the refinement begins with as many
+/// of them in one place as there are to be Gaussians, each fainter, so that together they show about what one alone does.
+/// `progress` hears of every step, and ends with what there is by `ControlFlow::Break`. The same input gives the same bytes.
 ///
 /// # Errors
 /// If there are no views, or they differ in size from their camera; if the configuration is impossible;
@@ -32,12 +34,12 @@ pub fn refine(
 ) -> Result<Cloud, FitError> {
     config.check()?;
     let targets = Targets::new(views, config.render_size)?;
-    let start = checked(cloud, usize::MAX)?;
+    let clouds = std::iter::once(cloud).chain(others).map(|cloud| checked(cloud, usize::MAX));
+    let clouds = clouds.collect::<Result<Vec<_>, _>>()?;
+    let hold = Hold::new(&clouds, &config.hold)?;
+    let start = together(&clouds, config.gaussians);
     let fit = config.fit(start.len());
     fit.check()?;
-    let others = others.iter().map(|other| checked(other, usize::MAX)).collect::<Result<Vec<_>, _>>()?;
-    let held: Vec<&Cloud> = std::iter::once(&start).chain(&others).collect();
-    let hold = Hold::new(&held, &config.hold)?;
     let mut rng = ChaCha8Rng::seed_from_u64(config.seed);
     // A stream of its own: the photos come in the same order with and without a hold.
     let mut hold_rng = ChaCha8Rng::seed_from_u64(config.seed);
@@ -48,4 +50,21 @@ pub fn refine(
         chosen.into_iter().try_for_each(|view| hold.add(objective, cloud, view, background))
     };
     optimise(start, &targets, &fit, &mut rng, holding, progress)
+}
+
+/// As many of `clouds` as `most` Gaussians allow, but the first in any case, in one place. Each Gaussian becomes what relocation
+/// makes of one of so many copies: were the clouds equal, they would look as one.
+fn together(clouds: &[Cloud], most: usize) -> Cloud {
+    let mut total = 0;
+    let fitting = clouds.iter().take_while(|cloud| {
+        total += cloud.len();
+        total <= most
+    });
+    let copies = fitting.count();
+    if copies < 2 {
+        return clouds[0].clone();
+    }
+    let mut all = Cloud::from_rows(clouds[..copies].iter().flat_map(Cloud::rows).copied().collect());
+    (0..all.len()).for_each(|i| split(&mut all, i, copies));
+    all
 }

@@ -194,6 +194,37 @@ fn refining_helps_seen_and_unseen_views() {
     assert_eq!(refine(&start, &[], &views, &config, go).unwrap().len(), 60);
 }
 
+/// Refined together, equal clouds look as one does, and there are no more Gaussians than were asked for.
+#[test]
+fn clouds_are_refined_together() {
+    let scene = ball(60, 21);
+    let start = disturbed(&scene, 22);
+    let (views, alone) = (ring(4, 64, &scene), ring(4, 64, &start));
+    let begun = |others: &[Cloud], gaussians| {
+        let hold = small_hold();
+        // Too slow to move anything.
+        let rates = Rates { mean: 1e-9, scale: 0.0, rotation: 0.0, opacity: 0.0, color: 0.0 };
+        let config =
+            RefineConfig { steps: 1, growth_rounds: 0, gaussians, rates, final_mean_rate: 1e-9, hold, ..Default::default() };
+        refine(&start, others, &views, &config, go).unwrap()
+    };
+    let other = disturbed(&scene, 23);
+    for (others, gaussians, expected) in [
+        (vec![], 240, 60),
+        (vec![start.clone(); 3], 240, 240),
+        (vec![start.clone(); 3], 239, 180),
+        (vec![other.clone(); 3], 100, 60),
+        (vec![other.clone()], 10, 60),
+    ] {
+        let together = begun(&others, gaussians);
+        assert_eq!(together.len(), expected);
+        assert!(psnr(&together, &alone) > 30.0, "{expected}: {} dB", psnr(&together, &alone));
+    }
+    // What others show is there, too.
+    let (both, beside) = (begun(std::slice::from_ref(&other), 120), ring(4, 64, &other));
+    assert!(psnr(&both, &beside) > psnr(&start, &beside) + 1.0);
+}
+
 /// All views from one side: that side gets better, and the other, which they say nothing of, stays what it was.
 #[test]
 fn a_hold_keeps_the_unseen_side() {

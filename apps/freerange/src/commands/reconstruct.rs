@@ -92,7 +92,7 @@ pub struct Sampling {
     /// place where no view looks; 500 are enough, 0 is none [default: the checkpoint's].
     #[arg(long, value_name = "STEPS")]
     pub refine: Option<usize>,
-    /// Hold that refinement at the mean pictures of so many samples; 1 is the sample alone [default: the checkpoint's].
+    /// Begin that refinement with so many samples together, and hold it at their mean pictures; 1 is the sample alone [default: the checkpoint's].
     #[arg(long, value_name = "SAMPLES", value_parser = clap::value_parser!(u8).range(1..=64))]
     pub ensemble: Option<u8>,
     /// Fit a sample from pure noise to the input views in so many steps before it is mended; 0 is none [default: the checkpoint's].

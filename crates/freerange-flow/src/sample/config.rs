@@ -49,8 +49,8 @@ pub struct SampleConfig {
     /// Steps of 3DGS-MCMC on the input views that follow ([`freerange_fit::refine`]); [`reconstruct`](super::reconstruct)
     /// itself takes none.
     pub refine: usize,
-    /// How many samples refinement is held at the mean pictures of, each from a fit and noise of its own; what is refined is the
-    /// first. [`reconstruct`](super::reconstruct) itself draws what it is asked for.
+    /// How many samples refinement begins with and is held at the mean pictures of, each from a fit and noise of its own.
+    /// [`reconstruct`](super::reconstruct) itself draws what it is asked for.
     #[serde(skip_serializing_if = "is_one")]
     pub ensemble: usize,
     /// Steps of a [fit](freerange_fit::polish) of the input views, at the size that quick fits have, that follow a sample from pure noise before it is
