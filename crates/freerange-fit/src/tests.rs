@@ -204,8 +204,15 @@ fn clouds_are_refined_together() {
         let hold = small_hold();
         // Too slow to move anything.
         let rates = Rates { mean: 1e-9, scale: 0.0, rotation: 0.0, opacity: 0.0, color: 0.0 };
-        let config =
-            RefineConfig { steps: 1, growth_rounds: 0, gaussians, rates, final_mean_rate: 1e-9, hold, ..Default::default() };
+        let config = RefineConfig {
+            steps: 1,
+            growth_rounds: 0,
+            gaussians,
+            rates,
+            final_mean_rate: 1e-9,
+            hold,
+            ..Default::default()
+        };
         refine(&start, others, &views, &config, go).unwrap()
     };
     let other = disturbed(&scene, 23);
