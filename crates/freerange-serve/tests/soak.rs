@@ -80,10 +80,10 @@ fn two_hundred_jobs_by_twenty_clients() {
             }
         }
     };
-    // The first clients make the memory that threads keep.
-    thread::scope(|s| (0..6).for_each(|c| drop(s.spawn(move || client(c)))));
+    // The first clients make the memory that threads keep: as many at once as afterwards.
+    thread::scope(|s| (0..10).for_each(|c| drop(s.spawn(move || client(c)))));
     let before = resources();
-    thread::scope(|s| (6..20).for_each(|c| drop(s.spawn(move || client(c)))));
+    thread::scope(|s| (10..20).for_each(|c| drop(s.spawn(move || client(c)))));
     thread::sleep(Duration::from_millis(300));
     let after = resources();
 
