@@ -105,9 +105,9 @@ fn every_step_is_told_and_the_last_estimate_is_the_result_in_the_users_frame() {
     assert_eq!(plain.samples[0].gaussians, unrefined[0]);
 }
 
-/// Members only help: the first sample is what it is without them, what comes of it is not.
+/// The first sample is what it is without the other members, what comes of it is not.
 #[test]
-fn an_ensemble_holds_the_refinement_of_its_first_member() {
+fn an_ensemble_is_refined_together() {
     let model = model();
     let views = bowl();
     let mut options = short(&model);
