@@ -15,7 +15,7 @@ pub enum Stage {
     Frame,
     /// Fits Gaussians to the views quickly, for sampling to start from.
     Fit,
-    /// Samples with the network.
+    /// Samples with the network; a sample from pure noise is polished and mended, too.
     Sample,
     /// Refines a sample on the views.
     Refine,
@@ -51,7 +51,7 @@ pub struct Progress<'a> {
     pub done: usize,
     /// All its steps.
     pub total: usize,
-    /// The photometric loss of the last step of a fit or a refinement.
+    /// The photometric loss of the last step of a fit, of polishing or of a refinement.
     pub loss: Option<f64>,
     pub(crate) estimate: Option<(Known<'a>, &'a Similarity)>,
 }
@@ -72,7 +72,7 @@ impl<'a> Progress<'a> {
 
     /// What the Gaussians are by now, in the frame of the views: the state of a fit, one cloud, which all samples start from; while sampling,
     /// what the network takes the clean Gaussians of each sample to be; while refining, the state of sample [`Progress::sample`], one cloud.
-    /// None when a stage begins, and for the other members of an ensemble. Costs a copy; on a GPU it waits for the step. Whether it
+    /// None when a stage begins, while a sample is polished or mended, and for the other members of an ensemble. Costs a copy; on a GPU it waits for the step. Whether it
     /// is called changes no result.
     ///
     /// # Errors

@@ -183,59 +183,95 @@ impl Reconstructor {
         members: usize,
         tell: &mut impl FnMut(&Progress<'_>) -> Result<(), Error>,
     ) -> Result<Vec<Vec<Cloud>>, Error> {
-        let (steps, total) = (options.sample.steps, members * options.sample.steps);
-        tell(&Progress::new(Stage::Sample, 0, total))?;
+        let mut steps = Steps { done: 0, total: members * steps_of_member(options), tell };
+        steps.tell(None)?;
         let mut clouds = vec![Vec::with_capacity(members); options.seeds.len()];
         for member in 0..members {
-            let told = |estimate: &Estimate<'_>| {
-                let told = Progress::new(Stage::Sample, member * steps + estimate.index + 1, total);
-                let known = (member == 0).then_some((Known::Sampled(estimate), &placed.frame.canonical_from_user));
-                tell(&Progress { estimate: known, ..told })
-            };
-            let sampled = self.sample(&placed.shown, fits.get(member), options, member as u64, told)?;
+            // The other members only help the first: nobody is shown them.
+            let place = (member == 0).then_some(&placed.frame.canonical_from_user);
+            let sampled = self.sample(&placed.shown, fits.get(member), options, member as u64, place, &mut steps)?;
             clouds.iter_mut().zip(sampled).for_each(|(members, cloud)| members.push(cloud));
         }
         Ok(clouds)
     }
 
     /// One cloud per seed, of member `member` of an ensemble, for views in the canonical frame and their quick fit, if
-    /// sampling starts from one.
+    /// sampling starts from one. Estimates are shown where there is a `place`.
     fn sample(
         &self,
         views: &[View],
         fit: Option<&Cloud>,
         options: &Options,
         member: u64,
-        mut told: impl FnMut(&Estimate<'_>) -> Result<(), Error>,
+        place: Option<&Similarity>,
+        steps: &mut Steps<'_, impl FnMut(&Progress<'_>) -> Result<(), Error>>,
     ) -> Result<Vec<Cloud>, Error> {
         let config = &options.sample;
         if let (Some(fit), true) = (fit, options.without_network) {
             let slice = tree_slice(fit, config.depth.unwrap_or(self.checkpoint.depth))?;
+            steps.done += config.steps;
             return Ok(vec![slice; options.seeds.len()]);
         }
-        let mut told = |estimate: &Estimate<'_>| told(estimate).map_or(ControlFlow::Break(()), ControlFlow::Continue);
         // The first member is what it is without the others, which draw from far away.
         let seeds: Vec<u64> = options.seeds.iter().map(|seed| seed.wrapping_add(member << 32)).collect();
-        let fits = fit.map(std::slice::from_ref);
-        let sampled = reconstruct(&self.checkpoint, &[views], fits, config, &seeds, &self.device, &mut told)?;
-        let mut clouds: Vec<Cloud> = sampled.into_iter().flatten().collect();
-        if config.polish > 0 && config.start.is_none() {
-            let steps = QuickFitConfig { iterations: config.polish, ..QuickFitConfig::default() };
+        let mut clouds = self.network(views, fit, config, &seeds, place, steps)?;
+        if config.polishing() > 0 {
+            let quick = QuickFitConfig { iterations: config.polishing(), ..QuickFitConfig::default() };
             for (cloud, &seed) in clouds.iter_mut().zip(&seeds) {
-                *cloud = polish(cloud, views, &steps, seed, |_| ControlFlow::Continue(()))?;
+                let done = [steps.done, steps.total];
+                *cloud = watched(Stage::Sample, 0, None, steps.tell, done, |p| polish(cloud, views, &quick, seed, p))?;
+                steps.done += quick.iterations;
             }
         }
         if let Some(mending) = config.mending() {
             for (cloud, seed) in clouds.iter_mut().zip(&seeds) {
-                let (start, seeds) = (std::slice::from_ref(&*cloud), std::slice::from_ref(seed));
-                let mended =
-                    reconstruct(&self.checkpoint, &[views], Some(start), &mending, seeds, &self.device, |_| {
-                        ControlFlow::Continue(())
-                    })?;
-                *cloud = mended.into_iter().flatten().next().expect("one object, one seed");
+                let mended = self.network(views, Some(cloud), &mending, std::slice::from_ref(seed), None, steps)?;
+                *cloud = mended.into_iter().next().expect("one object, one seed");
             }
         }
         Ok(clouds)
+    }
+
+    /// What the network makes of views, starting from `fit` where `config` says so. One cloud per seed.
+    fn network(
+        &self,
+        views: &[View],
+        fit: Option<&Cloud>,
+        config: &SampleConfig,
+        seeds: &[u64],
+        place: Option<&Similarity>,
+        steps: &mut Steps<'_, impl FnMut(&Progress<'_>) -> Result<(), Error>>,
+    ) -> Result<Vec<Cloud>, Error> {
+        let before = steps.done;
+        let told = |estimate: &Estimate<'_>| {
+            steps.done = before + estimate.index + 1;
+            let told = steps.tell(place.map(|place| (Known::Sampled(estimate), place)));
+            told.map_or(ControlFlow::Break(()), ControlFlow::Continue)
+        };
+        let fits = fit.map(std::slice::from_ref);
+        let clouds = reconstruct(&self.checkpoint, &[views], fits, config, seeds, &self.device, told)?;
+        steps.done = before + config.steps;
+        Ok(clouds.into_iter().flatten().collect())
+    }
+}
+
+/// Steps of sampling that are told of each member of an ensemble: the network's, and sample by sample those of polishing and mending.
+fn steps_of_member(options: &Options) -> usize {
+    let config = &options.sample;
+    let mending = config.mending().map_or(0, |mending| mending.steps);
+    config.steps + options.seeds.len() * (config.polishing() + mending)
+}
+
+/// How far sampling has come, and whom that is told.
+struct Steps<'a, T> {
+    done: usize,
+    total: usize,
+    tell: &'a mut T,
+}
+
+impl<T: FnMut(&Progress<'_>) -> Result<(), Error>> Steps<'_, T> {
+    fn tell(&mut self, estimate: Option<(Known<'_>, &Similarity)>) -> Result<(), Error> {
+        (self.tell)(&Progress { estimate, ..Progress::new(Stage::Sample, self.done, self.total) })
     }
 }
 

@@ -154,6 +154,43 @@ fn a_sample_from_noise_is_mended() {
     assert!(after > before + 1.0, "{before} dB, polished {after} dB");
 }
 
+/// Polishing and mending take longer than sampling does: they are told of, and can be stopped, too.
+#[test]
+fn all_that_is_done_from_noise_is_told() {
+    let (model, views) = (model(), bowl());
+    let mut options = short(&model);
+    options.sample = options.sample.without_start();
+    options.sample =
+        SampleConfig { steps: 2, polish: 5, mend: 2, ensemble: 2, refine: 1, photometric_repeats: 1, ..options.sample };
+    let mut told = Vec::new();
+    model
+        .run(&views, &options, &mut |p| {
+            if p.stage == Stage::Sample {
+                let estimates = p.estimate().unwrap().map_or(0, |clouds| clouds.len());
+                told.push((p.done, p.total, p.loss.is_some(), estimates));
+            }
+            ControlFlow::Continue(())
+        })
+        .unwrap();
+    // Of each member: the network's steps, with estimates of both samples, then two samples polished, then mended.
+    let total = 2 * (2 + 2 * 5 + 2 * 2);
+    let expected = (0..=total).map(|done| {
+        let of_member = (done + 15) % 16 + 1;
+        let polished = done > 0 && (3..=12).contains(&of_member);
+        (done, total, polished, if (1..=2).contains(&done) { 2 } else { 0 })
+    });
+    assert_eq!(told, expected.collect::<Vec<_>>());
+
+    for last in [5, 14] {
+        let mut reached = 0;
+        let stopped = model.run(&views, &options, &mut |p| {
+            reached = if p.stage == Stage::Sample { p.done } else { 0 };
+            if reached == last { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        });
+        assert!(matches!(stopped, Err(Error::Cancelled)) && reached == last, "{last}: {reached}");
+    }
+}
+
 #[test]
 fn it_stops_where_it_is_told_to() {
     let (model, views) = (model(), bowl());

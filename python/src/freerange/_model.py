@@ -27,10 +27,10 @@ class Step:
     done: int
     #: All its steps.
     total: int
-    #: The photometric loss of the last step of a fit or a refinement.
+    #: The photometric loss of the last step of a fit, of polishing or of a refinement.
     loss: float | None
     #: What is known of the Gaussians by now, in your cameras' frame: of each sample in "sample", else one. Empty when a stage
-    #: begins, and where the work is on helpers of the first sample.
+    #: begins, while a sample is polished or mended, and where the work is on helpers of the first sample.
     gaussians: tuple[Gaussians, ...]
 
 

@@ -135,6 +135,11 @@ impl SampleConfig {
         self
     }
 
+    /// How many steps samples from pure noise are [polished](Self::polish); 0 for what starts from a fit.
+    pub fn polishing(&self) -> usize {
+        if self.start.is_none() { self.polish } else { 0 }
+    }
+
     /// How samples from pure noise are mended: see [`mend`](Self::mend); none if they are not.
     pub fn mending(&self) -> Option<Self> {
         let start = StartConfig { time: 0.0, noise: 0.0, ..StartConfig::default() };
