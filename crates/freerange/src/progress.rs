@@ -72,8 +72,8 @@ impl<'a> Progress<'a> {
 
     /// What the Gaussians are by now, in the frame of the views: the state of a fit, one cloud, which all samples start from; while sampling,
     /// what the network takes the clean Gaussians of each sample to be; while refining, the state of sample [`Progress::sample`], one cloud.
-    /// None when a stage begins, while a sample is polished or mended, and for the other members of an ensemble. Costs a copy; on a GPU it waits for the step. Whether it
-    /// is called changes no result.
+    /// None when a stage begins, while a sample is polished or mended, and for the other members of an ensemble. Costs a copy; on a GPU it
+    /// waits for the step. Whether it is called changes no result.
     ///
     /// # Errors
     /// If a device fails.

@@ -209,7 +209,6 @@ impl Reconstructor {
         let config = &options.sample;
         if let (Some(fit), true) = (fit, options.without_network) {
             let slice = tree_slice(fit, config.depth.unwrap_or(self.checkpoint.depth))?;
-            steps.done += config.steps;
             return Ok(vec![slice; options.seeds.len()]);
         }
         // The first member is what it is without the others, which draw from far away.
