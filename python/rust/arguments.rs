@@ -120,6 +120,7 @@ pub struct Sampling {
     ensemble: Option<usize>,
     polish: Option<usize>,
     mend: Option<usize>,
+    regroup: Option<usize>,
     start: Option<String>,
     depth: Option<u32>,
     cfg_scale: Option<f32>,
@@ -149,6 +150,7 @@ impl Sampling {
         sample.refine = self.refine.unwrap_or(sample.refine);
         sample.polish = self.polish.unwrap_or(sample.polish);
         sample.mend = self.mend.unwrap_or(sample.mend);
+        sample.regroup = self.regroup.unwrap_or(sample.regroup);
         sample.ensemble = self.ensemble.unwrap_or(sample.ensemble);
         if let Some(name) = self.solver {
             let solver: Option<Solver> = serde_json::from_value(name.as_str().into()).ok();

@@ -6,6 +6,7 @@ use burn::tensor::Device;
 use freerange_build::{Generated, MakingConfig};
 use freerange_camera::{View, image_ops::composite};
 use freerange_data::ObjectSource;
+use freerange_fit::tree_slice;
 use freerange_flow::{
     FlowError,
     batch::{Batch, step_rng},
@@ -418,6 +419,20 @@ fn a_fit_is_mended() {
         "fit {from:.2} dB, mended {found:.2} dB, at best {to:.2} dB"
     );
     // Photometric guidance moves what is fed back.
-    let pushed = sample(&[5], &SampleConfig { lambda_pg: 0.05, ..white }, &mut steps);
+    let pushed = sample(&[5], &SampleConfig { lambda_pg: 0.05, ..white.clone() }, &mut steps);
     assert_ne!(pushed[0], clouds[0]);
+
+    // To regroup what is fed back is to begin anew with it in the place of the fit.
+    let config = |steps, regroup| SampleConfig { steps, regroup, ..white.clone() };
+    let mend = |fit: &Cloud, config: &SampleConfig| {
+        let go = |_: &_| ControlFlow::Continue(());
+        let fits = [fit.clone()];
+        reconstruct(&checkpoint, &[&inputs], Some(&fits), config, &[5], &device, go).unwrap().remove(0).remove(0)
+    };
+    let half = mend(&fit.gaussians, &config(2, 0));
+    let [anew, regrouped, straight] =
+        [mend(&half, &config(2, 0)), mend(&fit.gaussians, &config(4, 2)), mend(&fit.gaussians, &config(4, 0))];
+    assert_ne!(tree_slice(&half, 6).unwrap(), half, "mending moves Gaussians past each other");
+    assert_eq!(anew, regrouped);
+    assert_ne!(straight, regrouped);
 }

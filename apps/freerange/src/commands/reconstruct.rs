@@ -101,6 +101,10 @@ pub struct Sampling {
     /// Mend a sample from pure noise in so many passes, as fits are mended; 0 is none [default: the checkpoint's].
     #[arg(long, value_name = "PASSES")]
     pub mend: Option<usize>,
+    /// Put the Gaussians that a fit is mended to in the order of a tree of their own after every so many steps; 0 is never
+    /// [default: the checkpoint's].
+    #[arg(long, value_name = "STEPS")]
+    pub regroup: Option<usize>,
     /// Seed of the (first) sample.
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
@@ -193,6 +197,7 @@ impl Sampling {
         sample.refine = self.refine.unwrap_or(sample.refine);
         sample.polish = self.polish.unwrap_or(sample.polish);
         sample.mend = self.mend.unwrap_or(sample.mend);
+        sample.regroup = self.regroup.unwrap_or(sample.regroup);
         sample.ensemble = self.ensemble.map_or(sample.ensemble, usize::from);
         options.seeds = (0..u64::from(samples)).map(|i| self.seed.wrapping_add(i)).collect();
         options.frame.up = self.up.or_z();

@@ -15,6 +15,10 @@ pub struct SampleConfig {
     pub steps: usize,
     /// How they are taken.
     pub solver: Solver,
+    /// Steps of [`Solver::Hold`] after which the estimate's Gaussians are put in the order of a tree of their own, with its
+    /// names of their axes, as those of a fit are: they have moved since. 0: never. On a GPU this waits for the steps before.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub regroup: usize,
     /// Make `2^depth` Gaussians; left out: as many as at the depth the model was trained at. Tokens carry no position,
     /// so that any number can be drawn, but sizes are those of the trained depth.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -96,6 +100,7 @@ impl Default for SampleConfig {
         Self {
             steps: 50,
             solver: Solver::Euler,
+            regroup: 0,
             depth: None,
             start: None,
             cfg_scale: 2.0,
