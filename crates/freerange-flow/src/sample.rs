@@ -28,7 +28,7 @@ use crate::{FlowError, photometric::Photometric};
 ///
 /// `objects` are the views of each object, as many for each, in its canonical frame (object within radius 0.5 of the
 /// origin); so are the results, `[objects][seeds]`. `fits` are [quick fits](freerange_fit::quick_fit) of the views of each
-/// object, which `config.start` asks for and nothing else looks at. All samples run as one batch. `progress` is told of
+/// object, or for each object of all its seeds, which `config.start` asks for and nothing else looks at. All samples run as one batch. `progress` is told of
 /// every step and may end it all by `ControlFlow::Break`; on a GPU, the step is only queued by then, and nothing waits for
 /// it but the end and whoever asks for the estimate's Gaussians.
 ///
@@ -47,7 +47,7 @@ pub fn reconstruct(
     if objects.is_empty() || seeds.is_empty() {
         return Ok(vec![Vec::new(); objects.len()]);
     }
-    let start = config.start.as_ref().map(|start| Start::new(start, fits, objects.len())).transpose()?;
+    let start = config.start.as_ref().map(|start| Start::new(start, fits, objects.len(), seeds.len())).transpose()?;
     let drawn = Drawn::new(checkpoint, config, start, objects.len(), seeds, device)?;
     let sampler = Sampler::new(checkpoint, objects, config, seeds.len(), &drawn, device)?;
     let guide = |step: &Step, estimate: &Tensor<3>| {

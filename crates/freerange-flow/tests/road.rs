@@ -425,9 +425,8 @@ fn a_fit_is_mended() {
     // To regroup what is fed back is to begin anew with it in the place of the fit.
     let config = |steps, regroup| SampleConfig { steps, regroup, ..white.clone() };
     let mend = |fit: &Cloud, config: &SampleConfig| {
-        let go = |_: &_| ControlFlow::Continue(());
-        let fits = [fit.clone()];
-        reconstruct(&checkpoint, &[&inputs], Some(&fits), config, &[5], &device, go).unwrap().remove(0).remove(0)
+        let (fits, go) = ([fit.clone()], ControlFlow::Continue(()));
+        reconstruct(&checkpoint, &[&inputs], Some(&fits), config, &[5], &device, |_| go).unwrap().remove(0).remove(0)
     };
     let half = mend(&fit.gaussians, &config(2, 0));
     let [anew, regrouped, straight] =

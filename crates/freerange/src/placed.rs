@@ -44,29 +44,41 @@ impl Placed {
         Ok(Self { frame, canonical, chosen, shown })
     }
 
-    /// A quick fit for each member of an ensemble. The first one moves frame and views.
+    /// A quick fit for each member of the ensemble of each seed, `[members][seeds]`. The first of seed 0 moves frame and views, of
+    /// whatever seed samples are: they do not depend on what is drawn beside them.
     pub fn quick_fits(
         &mut self,
         config: &QuickFitConfig,
+        seeds: &[u64],
         members: usize,
         tell: &mut impl FnMut(&Progress<'_>) -> Result<(), Error>,
-    ) -> Result<Vec<Cloud>, Error> {
-        let mut fits = Vec::with_capacity(members);
-        for member in 0..members {
-            let done = [member * config.iterations, members * config.iterations];
-            let seed = member as u64;
-            // The other members only help the first: nobody is shown them.
-            let place = (member == 0).then_some(&self.frame.canonical_from_user);
-            let mut fit = watched(Stage::Fit, 0, place, tell, done, |p| quick_fit(&self.shown, config, seed, p))?;
-            // The fit knows better than the masks where the object is; it moves along, so that one is enough.
-            if member == 0 && !self.frame.kept {
-                let correction = frame_of(&fit, &self.shown)?;
-                fit.transform(correction.scale, correction.rotation, correction.translation);
-                self.correct(&correction);
-            }
-            fits.push(fit);
+    ) -> Result<Vec<Vec<Cloud>>, Error> {
+        let of_members = |member| seeds.iter().map(move |seed| seed.wrapping_mul(MOST_MEMBERS).wrapping_add(member));
+        let numbers: Vec<Vec<u64>> = (0..members as u64).map(|member| of_members(member).collect()).collect();
+        let framing = !self.frame.kept && !numbers.iter().flatten().any(|&number| number == 0);
+        let total = (members * seeds.len() + usize::from(framing)) * config.iterations;
+        let mut done = 0;
+        let mut fit = |views: &[View], place: Option<&Similarity>, number| {
+            // One fit is enough to look at.
+            let place = place.filter(|_| done == 0);
+            let fit = watched(Stage::Fit, 0, place, tell, [done, total], |p| quick_fit(views, config, number, p))?;
+            done += config.iterations;
+            Ok::<_, Error>(fit)
+        };
+        // The fit knows better than the masks where the object is; it moves along, so that one is enough.
+        let mut first = None;
+        if !self.frame.kept {
+            let mut moved = fit(&self.shown, Some(&self.frame.canonical_from_user), 0)?;
+            let correction = frame_of(&moved, &self.shown)?;
+            moved.transform(correction.scale, correction.rotation, correction.translation);
+            self.correct(&correction);
+            first = Some(moved);
         }
-        Ok(fits)
+        let mut made = |number| match &first {
+            Some(first) if number == 0 => Ok(first.clone()),
+            _ => fit(&self.shown, Some(&self.frame.canonical_from_user), number),
+        };
+        numbers.into_iter().map(|seeds| seeds.into_iter().map(&mut made).collect()).collect()
     }
 
     fn correct(&mut self, correction: &Similarity) {
@@ -77,6 +89,9 @@ impl Placed {
         self.frame.notes.push(format!("the quick fit moved it by {shift:.3} and scaled it by {scale:.3}"));
     }
 }
+
+/// Numbers that the fits of one seed have for its members: as many as `sample.ensemble` allows.
+const MOST_MEMBERS: u64 = 64;
 
 /// A fit whose steps are told, as those after so many of so many; what it has when it is stopped is of no use.
 pub(crate) fn watched(

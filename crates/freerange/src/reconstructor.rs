@@ -149,12 +149,12 @@ impl Reconstructor {
         let mut fits = Vec::new();
         if let Some(StartConfig { fit, .. }) = &options.sample.start {
             let begin = Instant::now();
-            fits = placed.quick_fits(fit, members, &mut tell)?;
+            fits = placed.quick_fits(fit, &options.seeds, members, &mut tell)?;
             seconds.push((Stage::Fit, begin.elapsed().as_secs_f64()));
         } else if options.sample.polish > 0 {
             // What is polished begins elsewhere, but where the object is, a quick fit knows best there, too.
             let begin = Instant::now();
-            placed.quick_fits(&QuickFitConfig::default(), 1, &mut tell)?;
+            placed.quick_fits(&QuickFitConfig::default(), &[0], 1, &mut tell)?;
             seconds.push((Stage::Fit, begin.elapsed().as_secs_f64()));
         }
 
@@ -178,7 +178,7 @@ impl Reconstructor {
     fn ensembles(
         &self,
         placed: &Placed,
-        fits: &[Cloud],
+        fits: &[Vec<Cloud>],
         options: &Options,
         members: usize,
         tell: &mut impl FnMut(&Progress<'_>) -> Result<(), Error>,
@@ -189,31 +189,38 @@ impl Reconstructor {
         for member in 0..members {
             // The other members only help the first: nobody is shown them.
             let place = (member == 0).then_some(&placed.frame.canonical_from_user);
-            let sampled = self.sample(&placed.shown, fits.get(member), options, member as u64, place, &mut steps)?;
+            let sampled = self.sample(
+                &placed.shown,
+                fits.get(member).map(Vec::as_slice),
+                options,
+                member as u64,
+                place,
+                &mut steps,
+            )?;
             clouds.iter_mut().zip(sampled).for_each(|(members, cloud)| members.push(cloud));
         }
         Ok(clouds)
     }
 
-    /// One cloud per seed, of member `member` of an ensemble, for views in the canonical frame and their quick fit, if
-    /// sampling starts from one. Estimates are shown where there is a `place`.
+    /// One cloud per seed, of member `member` of an ensemble, for views in the canonical frame and their quick fits, one per seed,
+    /// if sampling starts from them. Estimates are shown where there is a `place`.
     fn sample(
         &self,
         views: &[View],
-        fit: Option<&Cloud>,
+        fits: Option<&[Cloud]>,
         options: &Options,
         member: u64,
         place: Option<&Similarity>,
         steps: &mut Steps<'_, impl FnMut(&Progress<'_>) -> Result<(), Error>>,
     ) -> Result<Vec<Cloud>, Error> {
         let config = &options.sample;
-        if let (Some(fit), true) = (fit, options.without_network) {
-            let slice = tree_slice(fit, config.depth.unwrap_or(self.checkpoint.depth))?;
-            return Ok(vec![slice; options.seeds.len()]);
+        if let (Some(fits), true) = (fits, options.without_network) {
+            let depth = config.depth.unwrap_or(self.checkpoint.depth);
+            return fits.iter().map(|fit| Ok(tree_slice(fit, depth)?)).collect();
         }
         // The first member is what it is without the others, which draw from far away.
         let seeds: Vec<u64> = options.seeds.iter().map(|seed| seed.wrapping_add(member << 32)).collect();
-        let mut clouds = self.network(views, fit, config, &seeds, place, steps)?;
+        let mut clouds = self.network(views, fits, config, &seeds, place, steps)?;
         if config.polishing() > 0 {
             let quick = QuickFitConfig { iterations: config.polishing(), ..QuickFitConfig::default() };
             for (cloud, &seed) in clouds.iter_mut().zip(&seeds) {
@@ -224,18 +231,19 @@ impl Reconstructor {
         }
         if let Some(mending) = config.mending() {
             for (cloud, seed) in clouds.iter_mut().zip(&seeds) {
-                let mended = self.network(views, Some(cloud), &mending, std::slice::from_ref(seed), None, steps)?;
+                let (fit, seed) = (std::slice::from_ref(&*cloud), std::slice::from_ref(seed));
+                let mended = self.network(views, Some(fit), &mending, seed, None, steps)?;
                 *cloud = mended.into_iter().next().expect("one object, one seed");
             }
         }
         Ok(clouds)
     }
 
-    /// What the network makes of views, starting from `fit` where `config` says so. One cloud per seed.
+    /// What the network makes of views, starting from `fits`, one per seed, where `config` says so. One cloud per seed.
     fn network(
         &self,
         views: &[View],
-        fit: Option<&Cloud>,
+        fits: Option<&[Cloud]>,
         config: &SampleConfig,
         seeds: &[u64],
         place: Option<&Similarity>,
@@ -247,7 +255,6 @@ impl Reconstructor {
             let told = steps.tell(place.map(|place| (Known::Sampled(estimate), place)));
             told.map_or(ControlFlow::Break(()), ControlFlow::Continue)
         };
-        let fits = fit.map(std::slice::from_ref);
         let clouds = reconstruct(&self.checkpoint, &[views], fits, config, seeds, &self.device, told)?;
         steps.done = before + config.steps;
         Ok(clouds.into_iter().flatten().collect())

@@ -12,7 +12,7 @@ use rand_distr::{Distribution, StandardNormal};
 use super::{SampleConfig, StartConfig};
 use crate::FlowError;
 
-/// A start from quick fits, one for each object.
+/// A start from quick fits, one for each object or one for each of its seeds.
 #[derive(Clone, Copy)]
 pub(super) struct Start<'a> {
     pub(super) config: &'a StartConfig,
@@ -20,11 +20,16 @@ pub(super) struct Start<'a> {
 }
 
 impl<'a> Start<'a> {
-    pub(super) fn new(config: &'a StartConfig, fits: Option<&'a [Cloud]>, objects: usize) -> Result<Self, FlowError> {
+    pub(super) fn new(
+        config: &'a StartConfig,
+        fits: Option<&'a [Cloud]>,
+        objects: usize,
+        seeds: usize,
+    ) -> Result<Self, FlowError> {
         match fits {
-            Some(fits) if fits.len() == objects => Ok(Self { config, fits }),
+            Some(fits) if fits.len() == objects || fits.len() == objects * seeds => Ok(Self { config, fits }),
             given => {
-                let expected = format!("a quick fit of each of {objects} objects");
+                let expected = format!("a quick fit of each of {objects} objects, or of each of their {seeds} seeds");
                 Err(Invalid::new("sample.start", expected, given.map_or(0, <[Cloud]>::len)).into())
             }
         }
@@ -60,14 +65,15 @@ impl Drawn {
         let mut backgrounds = vec![Vec::with_capacity(b); config.steps];
         let mut guesses = Vec::new();
         for object in 0..objects {
-            let guess = match start {
-                None => None,
-                Some(start) => {
-                    let slice = tree_slice(&start.fits[object], depth)?;
-                    Some(checkpoint.normalization.normalize(&slice))
-                }
-            };
-            for &seed in seeds {
+            for (i, &seed) in seeds.iter().enumerate() {
+                let guess = match start {
+                    None => None,
+                    Some(start) => {
+                        let own = if start.fits.len() == objects { object } else { object * seeds.len() + i };
+                        let slice = tree_slice(&start.fits[own], depth)?;
+                        Some(checkpoint.normalization.normalize(&slice))
+                    }
+                };
                 let mut rng = ChaCha8Rng::seed_from_u64(seed);
                 let mut one: Vec<f32> = (0..n * channel::COUNT).map(|_| StandardNormal.sample(&mut rng)).collect();
                 match (&guess, start) {
