@@ -10,6 +10,7 @@ pub mod events;
 mod inherit;
 pub mod log;
 mod optimizer;
+mod order;
 pub mod path;
 pub mod photometric;
 pub mod ranks;
