@@ -120,7 +120,6 @@ impl From<FlowError> for CliError {
             FlowError::Fit(e) => e.into(),
             FlowError::NotFinite { .. }
             | FlowError::NoGradient
-            | FlowError::Splat(_)
             | FlowError::Cancelled
             | FlowError::Ranks { .. }
             | FlowError::Elsewhere { .. } => Self::failure(e),

@@ -133,10 +133,6 @@ pub struct LossConfig {
     pub self_conditioning: f32,
     /// Most estimates that are made in such a batch, each from the one before; the number is drawn for each batch.
     pub estimates: usize,
-    /// After how many of them Gaussians are put in the order of a tree of their own, those that they should be with them: as
-    /// [`SampleConfig::regroup`] does in sampling. In batches that start from fits; 0: never.
-    #[serde(skip_serializing_if = "is_zero")]
-    pub regroup: usize,
     /// Where the gradient that the network sees is taken; at the noisy sample where there is no estimate.
     pub gradient_at: GradientAt,
     /// Share of the batches whose input views all lie on one side of the object.
@@ -172,10 +168,6 @@ pub struct StartLoss {
 
 fn is_one(x: &usize) -> bool {
     *x == 1
-}
-
-fn is_zero(x: &usize) -> bool {
-    *x == 0
 }
 
 fn is_f32(wire: &Wire) -> bool {
@@ -232,7 +224,6 @@ impl Default for LossConfig {
             start: None,
             self_conditioning: 0.0,
             estimates: 1,
-            regroup: 0,
             gradient_at: GradientAt::Noisy,
             one_sided: 0.0,
             frame_jitter: FrameJitter::default(),
@@ -491,7 +482,6 @@ impl<M: Making> TrainConfig<M> {
             l.self_conditioning.to_string(),
         )?;
         check((1..=16).contains(&l.estimates), "loss.estimates", "1 to 16", l.estimates.to_string())?;
-        check(l.regroup == 0 || l.start.is_some(), "loss.regroup", "0 without loss.start", l.regroup.to_string())?;
         if let Some(start) = l.start {
             check((0.0..=1.0).contains(&start.share), "loss.start.share", "0 to 1", start.share.to_string())?;
             check((0.0..=2.0).contains(&start.noise), "loss.start.noise", "0 to 2", start.noise.to_string())?;

@@ -97,7 +97,4 @@ pub enum FlowError {
     /// Quick fits that sampling starts from, or how samples are measured.
     #[error(transparent)]
     Fit(#[from] freerange_fit::FitError),
-    /// Gaussians that cannot be put in the order of a tree.
-    #[error(transparent)]
-    Splat(#[from] freerange_splat::SplatError),
 }

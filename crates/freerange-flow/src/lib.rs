@@ -10,7 +10,6 @@ pub mod events;
 mod inherit;
 pub mod log;
 mod optimizer;
-mod order;
 pub mod path;
 pub mod photometric;
 pub mod ranks;

@@ -96,11 +96,6 @@ impl Photometric {
         normalized * self.std.clone() + self.mean.clone()
     }
 
-    /// Normalised channels from raw ones. `[b, n, 14]`
-    pub fn normalize(&self, raw: Tensor<3>) -> Tensor<3> {
-        (raw - self.mean.clone()) / self.std.clone()
-    }
-
     /// L1 between the renders of `normalized` (`[b, n, 14]`) and the targets: the mean over views, pixels and channels
     /// for each object. Returns `[b]`.
     pub fn l1(&self, normalized: Tensor<3>, targets: &Targets) -> Result<Tensor<1>, FlowError> {

@@ -92,7 +92,7 @@ impl Estimate<'_> {
 }
 
 /// Raw channels as Gaussians. `[objects * seeds, n, 14]` to `[objects][seeds]`
-pub(crate) fn clouds(raw: Tensor<3>, seeds: usize) -> Result<Vec<Vec<Cloud>>, FlowError> {
+fn clouds(raw: Tensor<3>, seeds: usize) -> Result<Vec<Vec<Cloud>>, FlowError> {
     let row = raw.dims()[1] * channel::COUNT;
     let values = raw.into_data().try_to_vec::<f32>().map_err(|_| FlowError::NoGradient)?;
     let cloud = |rows: &[f32]| {

@@ -10,7 +10,6 @@ use crate::{
     FlowError,
     batch::Batch,
     config::LossConfig,
-    order::Reordered,
     path::{flow_loss, interpolate},
     photometric::Photometric,
     sample::{GradientAt, scale_gradient},
@@ -44,57 +43,46 @@ pub fn step(
 ) -> Result<Losses, FlowError> {
     let b = batch.t.len();
     let t = Tensor::<1>::from_floats(batch.t.as_slice(), device);
-    let mut noisy = interpolate(batch.noise, batch.clean, t.clone());
+    let noisy = interpolate(batch.noise, batch.clean, t.clone());
 
     let tokens = batch.conditioning.encode(model) * batch.conditional.clone();
     // What is known besides the noisy sample: an earlier estimate of the clean one, and the photometric gradient there.
     // Both are zeroed together with the images, lest they leak them into the unconditional branch.
-    let feedback =
-        |earlier: Option<Tensor<3>>, noisy: &Tensor<3>| -> Result<(Feedback, Option<Tensor<1>>), FlowError> {
-            let gradient = match model.dit().gradient_channels() {
-                true => {
-                    let at = earlier.clone().filter(|_| config.gradient_at == GradientAt::Estimate);
-                    Some(photometric.gradient(at.unwrap_or_else(|| noisy.clone()), &batch.gradient_targets)?)
-                }
-                false => None,
-            };
-            let square = gradient.clone().map(|g| {
-                let [b, n, c] = g.dims();
-                g.square().reshape([b * n, c]).mean_dim(0).reshape([c])
-            });
-            let gradient = gradient.map(|g| scale_gradient(g, gradient_rms) * batch.conditional.clone());
-            let observation = match &earlier {
-                Some(earlier) if model.dit().observation_channels() => {
-                    Some(photometric.observe(earlier.clone(), &batch.gradient_targets)?)
-                }
-                _ => None,
-            };
-            let observation = observation.map(|o| o * batch.conditional.clone());
-            let estimate = earlier.filter(|_| model.dit().estimate_channels());
-            Ok((Feedback { gradient, estimate, observation }, square))
-        };
-    let mut data = batch.data;
-    let regroup = if batch.fits.is_some() { config.regroup } else { 0 };
-    let mut earlier = batch.fits;
-    for made in 1..=batch.estimates {
-        let (known, _) = feedback(earlier, &noisy)?;
-        let estimate = model.clone().valid().denoise(noisy.clone(), known, tokens.clone().inner(), t.clone());
-        // What is not finite has no tree; neither has it a finite loss, and the step will be left out.
-        let known_by_tree = regroup > 0 && made.is_multiple_of(regroup);
-        earlier = match known_by_tree.then(|| Reordered::new(estimate.clone(), photometric)) {
-            Some(Ok(tree)) => {
-                (noisy, data) = (tree.rows(noisy), tree.targets(data, photometric)?);
-                Some(tree.normalized(photometric, &estimate.device()))
+    let feedback = |earlier: Option<Tensor<3>>| -> Result<(Feedback, Option<Tensor<1>>), FlowError> {
+        let gradient = match model.dit().gradient_channels() {
+            true => {
+                let at = earlier.clone().filter(|_| config.gradient_at == GradientAt::Estimate);
+                Some(photometric.gradient(at.unwrap_or_else(|| noisy.clone()), &batch.gradient_targets)?)
             }
-            _ => Some(estimate),
+            false => None,
         };
+        let square = gradient.clone().map(|g| {
+            let [b, n, c] = g.dims();
+            g.square().reshape([b * n, c]).mean_dim(0).reshape([c])
+        });
+        let gradient = gradient.map(|g| scale_gradient(g, gradient_rms) * batch.conditional.clone());
+        let observation = match &earlier {
+            Some(earlier) if model.dit().observation_channels() => {
+                Some(photometric.observe(earlier.clone(), &batch.gradient_targets)?)
+            }
+            _ => None,
+        };
+        let observation = observation.map(|o| o * batch.conditional.clone());
+        let estimate = earlier.filter(|_| model.dit().estimate_channels());
+        Ok((Feedback { gradient, estimate, observation }, square))
+    };
+    let mut earlier = batch.fits;
+    for _ in 0..batch.estimates {
+        let (known, _) = feedback(earlier)?;
+        let plain = model.clone().valid();
+        earlier = Some(plain.denoise(noisy.clone(), known, tokens.clone().inner(), t.clone()));
     }
-    let (feedback, gradient_square) = feedback(earlier, &noisy)?;
+    let (feedback, gradient_square) = feedback(earlier)?;
     let estimate = model.denoise(noisy, feedback, tokens, t.clone()); // z1_hat
 
     let zero = || Tensor::<1>::zeros([b], device);
     let flow = match config.flow {
-        true => flow_loss(estimate.clone(), data, t, config.min_remaining),
+        true => flow_loss(estimate.clone(), batch.data, t, config.min_remaining),
         false => zero(),
     };
     let seen = match config.seen {

@@ -1,6 +1,6 @@
 //! The cloud: N Gaussians of 14 channels each, in the raw (unconstrained) parametrisation.
 
-use crate::{SplatError, align::relabel};
+use crate::SplatError;
 use glam::{DMat3, DQuat, DVec3};
 use rand::{Rng, seq::SliceRandom};
 
@@ -157,24 +157,6 @@ impl Cloud {
         self.select(order)
     }
 
-    /// The same Gaussians, the axes of each one named as close as can be to those of its counterpart in `reference`:
-    /// quaternions and the order of scales change, what is drawn does not.
-    ///
-    /// # Panics
-    /// If there are not as many in both.
-    pub fn named_like(&self, reference: &Self) -> Self {
-        assert_eq!(self.len(), reference.len(), "Gaussians one by one");
-        let mut out = self.clone();
-        for (row, reference) in out.iter_mut().zip(reference) {
-            let axes = |row: &Row| DMat3::from_quat(rotation(row));
-            let (old, log_scale) = (axes(row), vec3(row, channel::LOG_SCALE.start));
-            let (new, log_scale) = relabel(old, log_scale, axes(reference));
-            set_rotation(row, canonical(DQuat::from_mat3(&new).normalize()));
-            row[channel::LOG_SCALE].copy_from_slice(&log_scale.as_vec3().to_array());
-        }
-        out
-    }
-
     /// Checks that every channel is finite.
     ///
     /// # Errors
@@ -307,27 +289,6 @@ mod tests {
             assert_eq!(before.color(i), after.color(i));
             assert_eq!(before.opacity(i), after.opacity(i));
         }
-    }
-
-    #[test]
-    fn axes_are_named_like_those_of_others() {
-        let (mut cloud, reference) = (example(50, 3), example(50, 4));
-        cloud.canonicalize_rotations();
-        let named = cloud.named_like(&reference);
-        let agreement = |a: &Cloud, i: usize| {
-            let [a, b] = [a, &reference].map(|c| DMat3::from_quat(c.rotation(i)));
-            (0..3).map(|j| a.col(j).dot(b.col(j))).sum::<f64>()
-        };
-        for i in 0..cloud.len() {
-            assert!(named.covariance(i).abs_diff_eq(cloud.covariance(i), 1e-5 * cloud.scale(i).max_element().powi(2)));
-            // No rotation is farther than 62.8 degrees from the nearest of 24: the sum is 1 + 2 cos(angle).
-            assert!(agreement(&named, i) >= agreement(&cloud, i) - 1e-5 && agreement(&named, i) > 1.8);
-            let others = |c: &Cloud| (c.mean(i), c.opacity(i), c.color(i));
-            assert_eq!(others(&named), others(&cloud));
-        }
-        assert_ne!(named, cloud);
-        let again = cloud.named_like(&cloud);
-        assert!(again.rows().iter().zip(cloud.rows()).all(|(a, b)| (a - b).abs() < 1e-5), "its own names stay");
     }
 
     #[test]

@@ -99,11 +99,6 @@ impl LodTree {
         &self.nodes
     }
 
-    /// Which Gaussian of the input each leaf is, in tree order.
-    pub fn leaf_order(&self) -> impl Iterator<Item = usize> {
-        self.nodes.iter().filter_map(|node| node.leaf)
-    }
-
     /// Number of leaves; at least 1.
     #[expect(clippy::len_without_is_empty, reason = "a tree is never empty")]
     pub fn len(&self) -> usize {

@@ -2,16 +2,16 @@
 
 use std::cell::RefCell;
 
-use burn::tensor::{Device, Tensor};
+use burn::tensor::{Device, Tensor, TensorData};
 use freerange_camera::View;
+use freerange_fit::tree_slice;
 use freerange_model::{Checkpoint, Feedback, FreeRange, ModelConfig};
-use freerange_splat::channel;
+use freerange_splat::{Normalization, channel};
 
-use super::{GradientAt, SampleConfig, Solver, Step, drawn::Drawn};
+use super::{GradientAt, SampleConfig, Solver, Step, clouds, drawn::Drawn};
 use crate::{
     FlowError,
     batch::{Conditioning, squares},
-    order::Reordered,
     photometric::{Images, Photometric},
 };
 
@@ -53,6 +53,7 @@ pub(super) struct Sampler<'a> {
     /// The same, and none. `[2 b, m, c]`
     both: Tensor<3>,
     pub(super) photometric: Photometric,
+    normalization: &'a Normalization,
     /// Root mean square of the gradient's channels in training. `[1, 1, 14]`
     rms: Tensor<3>,
     /// What the gradient for the network is taken on.
@@ -98,6 +99,7 @@ impl<'a> Sampler<'a> {
             tokens,
             both,
             photometric: Photometric::new(&checkpoint.normalization, device),
+            normalization: &checkpoint.normalization,
             rms: Tensor::<1>::from_floats(checkpoint.gradient_rms, device).reshape([1, 1, channel::COUNT]),
             images,
             guiding,
@@ -110,10 +112,8 @@ impl<'a> Sampler<'a> {
     pub(super) fn estimate(&self, step: &Step) -> Result<Tensor<3>, FlowError> {
         let SampleConfig { solver, regroup, .. } = *self.config;
         if solver == Solver::Hold && regroup > 0 && step.index > 0 && step.index.is_multiple_of(regroup) {
-            if let Some(known) = self.previous.take() {
-                let known = Reordered::new(known, &self.photometric)?.normalized(&self.photometric, self.device);
-                self.previous.replace(Some(known));
-            }
+            let known = self.previous.take().map(|known| self.regrouped(known)).transpose()?;
+            self.previous.replace(known);
         }
         let feedback = self.feedback(step)?;
         let b = step.z.dims()[0];
@@ -135,6 +135,16 @@ impl<'a> Sampler<'a> {
         };
         self.previous.replace(Some(estimate.clone()));
         Ok(estimate)
+    }
+
+    /// The same Gaussians in the order of a tree of their own, as those of a fit are.
+    fn regrouped(&self, known: Tensor<3>) -> Result<Tensor<3>, FlowError> {
+        let shape = known.dims();
+        let mut rows = Vec::with_capacity(shape.iter().product());
+        for cloud in clouds(self.photometric.denormalize(known), 1)?.into_iter().flatten() {
+            rows.extend(self.normalization.normalize(&tree_slice(&cloud, shape[1].ilog2())?));
+        }
+        Ok(Tensor::from_data(TensorData::new(rows, shape), self.device))
     }
 
     /// What the network is told besides the sample: see [`Feedback`].
