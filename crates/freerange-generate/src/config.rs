@@ -122,6 +122,8 @@ pub struct GeneratorConfig {
     pub pattern_share: f32,
     /// Share of materials with a polished clear layer.
     pub gloss_share: f32,
+    /// Labels, writing and painted decoration. Without, each is its mean colour on otherwise the same object.
+    pub prints: bool,
 }
 
 impl Default for GeneratorConfig {
@@ -157,6 +159,7 @@ impl Default for GeneratorConfig {
             white_share: 0.27,
             pattern_share: 0.55,
             gloss_share: 0.4,
+            prints: true,
         }
     }
 }

@@ -13,6 +13,7 @@ use crate::style::{Style, unit_vector};
 use crate::{household, packaging, soft, vessels, woven};
 use freerange_core::Invalid;
 use freerange_mesh::Mesh;
+use freerange_mesh::Texture;
 use freerange_mesh::noise;
 
 /// Objects with more triangles than this get no further parts.
@@ -55,7 +56,24 @@ pub fn generate(seed: u64, config: &GeneratorConfig) -> Result<Mesh, Invalid> {
         Kind::Wire => woven::wire(a, s),
     }
     let rotation = rotation(s);
-    Ok(assembly.finish(rotation))
+    let mut mesh = assembly.finish(rotation);
+    if !config.prints {
+        mesh.materials.iter_mut().for_each(|m| unprint(&mut m.texture));
+    }
+    Ok(mesh)
+}
+
+/// Puts its mean colour in the place of a print.
+fn unprint(texture: &mut Texture) {
+    match texture {
+        Texture::Print(raster) => *texture = Texture::Flat(raster.mean()),
+        Texture::Worn(wear) => unprint(&mut wear.base),
+        Texture::Patches { base, over, .. } => {
+            unprint(base);
+            unprint(over);
+        }
+        _ => {}
+    }
 }
 
 /// The family of the object that [`generate`] makes of `seed`.

@@ -200,3 +200,25 @@ fn prints_show_marks_of_several_colours() {
         assert!(printed >= 10, "{kind:?}: {printed} prints with three colours");
     }
 }
+
+#[test]
+fn without_prints_an_object_keeps_its_shape_and_the_mean_colours_of_its_prints() {
+    let plain = GeneratorConfig { prints: false, ..GeneratorConfig::default() };
+    let mut replaced = 0;
+    for seed in 0..40 {
+        let (with, without) = (generate(seed, &GeneratorConfig::default()).unwrap(), generate(seed, &plain).unwrap());
+        assert_eq!(with.positions, without.positions);
+        assert_eq!(with.materials.len(), without.materials.len());
+        for (a, b) in with.materials.iter().zip(&without.materials) {
+            let Texture::Print(raster) = &a.texture else { continue };
+            let Texture::Flat(color) = b.texture else { panic!("seed {seed}: {:?}", b.texture) };
+            // Half a pixel off the corners, a look-up is a pixel.
+            let (w, h) = (raster.width(), raster.height());
+            let pixels = (0..w * h).map(|i| Vec2::new((i % w) as f32 + 0.5, (i / w) as f32 + 0.5));
+            let sum: Vec3 = pixels.map(|p| raster.sample(p / Vec2::new(w as f32, h as f32))).sum();
+            assert!((sum / (w * h) as f32 - color).abs().max_element() < 1e-3, "seed {seed}: {color}");
+            replaced += 1;
+        }
+    }
+    assert!(replaced >= 20, "{replaced}");
+}

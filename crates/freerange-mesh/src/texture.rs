@@ -59,6 +59,14 @@ impl Raster {
         }
     }
 
+    /// Mean colour, linear.
+    pub fn mean(&self) -> Vec3 {
+        let decode = |e: u8| f64::from(DECODE[e as usize]);
+        let sum: glam::DVec3 =
+            self.pixels.iter().map(|&[r, g, b, _]| glam::DVec3::new(decode(r), decode(g), decode(b))).sum();
+        (sum / self.pixels.len() as f64).as_vec3()
+    }
+
     /// Bilinear look-up in linear light; v points up, u wraps around, v is clamped.
     pub fn sample(&self, uv: Vec2) -> Vec3 {
         let x = uv.x.rem_euclid(1.0) * self.width as f32 - 0.5;
