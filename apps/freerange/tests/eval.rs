@@ -144,6 +144,14 @@ fn white_is_measured_resumed_refused_with_other_settings_and_restarted() {
     assert_eq!(time("a.full.4.json"), before);
     assert!(object("b.full.4.json").exists());
 
+    // What another program measured stays, and is said to be its.
+    assert!(!expect(0, &run).contains("other programs"));
+    let mut record: Value = serde_json::from_slice(&fs::read(object("b.full.4.json")).unwrap()).unwrap();
+    record["outcome"]["commit"] = "elsewhere".into();
+    fs::write(object("b.full.4.json"), record.to_string()).unwrap();
+    let message = expect(0, &run);
+    assert!(message.contains("commit elsewhere") && message.contains("--restart"), "{message}");
+
     let other = [&run[..], &["--metrics", "psnr"]].concat();
     let message = expect(2, &other);
     assert!(message.contains("metrics") && message.contains("--restart"), "{message}");

@@ -98,6 +98,14 @@ fn evaluate(args: &Args, job: &Job) -> Result<(), CliError> {
             true => println!("{}", serde_json::to_string_pretty(&report).map_err(CliError::input)?),
             false => print(&report, output),
         }
+        let others = others(&report, &shared.commit);
+        if !others.is_empty() {
+            eprintln!(
+                "some results are of other programs (commit {}; this one is {}): --restart makes them anew",
+                others.join(", "),
+                shared.commit
+            );
+        }
         verdict([&report])
     };
     job.together(if job.first() { report() } else { Ok(()) })
@@ -143,6 +151,11 @@ fn print(report: &Report, output: &Path) {
         println!("{metric} not computed: {reason}");
     }
     println!("{}", output.join("report.html").display());
+}
+
+/// The commits of other programs that results were taken from.
+fn others<'a>(report: &'a Report, commit: &str) -> Vec<&'a str> {
+    report.environment.commits.iter().map(String::as_str).filter(|other| *other != commit).collect()
 }
 
 /// An error if an object failed, or if there was nothing to measure.
