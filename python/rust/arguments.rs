@@ -121,6 +121,7 @@ pub struct Sampling {
     polish: Option<usize>,
     mend: Option<usize>,
     regroup: Option<usize>,
+    mirror: Option<f32>,
     start: Option<String>,
     depth: Option<u32>,
     cfg_scale: Option<f32>,
@@ -151,6 +152,7 @@ impl Sampling {
         sample.polish = self.polish.unwrap_or(sample.polish);
         sample.mend = self.mend.unwrap_or(sample.mend);
         sample.regroup = self.regroup.unwrap_or(sample.regroup);
+        sample.mirror = self.mirror.unwrap_or(sample.mirror);
         sample.ensemble = self.ensemble.unwrap_or(sample.ensemble);
         if let Some(name) = self.solver {
             let solver: Option<Solver> = serde_json::from_value(name.as_str().into()).ok();

@@ -2,6 +2,7 @@
 //!
 //! * [`fit`]: from nothing but views (Kheradmand et al. 2024), which is how training objects become clouds.
 //! * [`frame_of`]: where a fit says the object is.
+//! * [`find_mirror`]: the plane about which an object is its own mirror image, and [`mirrored`] photos of it.
 //! * [`psnr_over_white`]: how well Gaussians show what views show.
 //! * [`refine`]: the same from a cloud that is already good, held where no view looks.
 //!
@@ -15,6 +16,7 @@ mod frame;
 mod hold;
 mod init;
 mod mcmc;
+mod mirror;
 mod objective;
 mod quality;
 mod quick;
@@ -27,6 +29,7 @@ pub use config::{Background, FitConfig, HoldConfig, Rates, RefineConfig};
 pub use error::FitError;
 pub use fit::fit;
 pub use frame::frame_of;
+pub use mirror::{FoundMirror, Mirror, find_mirror, mirror_steps, mirrored};
 pub use quality::{over_white, psnr_over_white, render_over_white};
 pub use quick::{QuickFitConfig, polish, quick_fit, tree_slice};
 pub use refine::refine;

@@ -43,7 +43,7 @@ pub(crate) fn cameras(count: usize, size: u32, turn: f64) -> Vec<Camera> {
 }
 
 /// The cloud as seen by a camera, with straight alpha.
-fn photograph(cloud: &Cloud, camera: &Camera) -> View {
+pub(crate) fn photograph(cloud: &Cloud, camera: &Camera) -> View {
     let out = render(cloud.rows(), &[*camera], &[[0.0; 3]], &RasterConfig::default()).unwrap();
     let mut image = image::RgbaImage::new(camera.width, camera.height);
     for (i, pixel) in image.pixels_mut().enumerate() {

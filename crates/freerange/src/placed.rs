@@ -3,7 +3,9 @@
 use std::ops::ControlFlow;
 
 use freerange_camera::{CanonicalFrame, FrameConfig, Similarity, View};
-use freerange_fit::{FitProgress, QuickFitConfig, frame_of, quick_fit};
+use freerange_fit::{
+    FitProgress, FoundMirror, QuickFitConfig, find_mirror, frame_of, mirror_steps, mirrored, quick_fit,
+};
 use freerange_splat::Cloud;
 
 use crate::{
@@ -19,8 +21,10 @@ pub(crate) struct Placed {
     pub canonical: Vec<View>,
     /// Which of them the model is shown, ascending.
     pub chosen: Vec<usize>,
-    /// These, in the canonical frame.
+    /// These, in the canonical frame, and what is added to them.
     pub shown: Vec<View>,
+    /// Whether they are where they are to stay.
+    settled: bool,
 }
 
 impl Placed {
@@ -41,7 +45,48 @@ impl Placed {
                 .notes
                 .push(format!("{uneven} of {all} views are not square: the model is shown squares, cut or padded"));
         }
-        Ok(Self { frame, canonical, chosen, shown })
+        let settled = frame.kept;
+        Ok(Self { frame, canonical, chosen, shown, settled })
+    }
+
+    /// Adds mirrored photos as further views where the object is its own mirror image: where they contradict the photos by `most` or less.
+    pub fn mirror(
+        &mut self,
+        config: &QuickFitConfig,
+        most: f32,
+        tell: &mut impl FnMut(&Progress<'_>) -> Result<(), Error>,
+    ) -> Result<(), Error> {
+        let framing = if self.settled { 0 } else { config.iterations };
+        let total = framing + mirror_steps(config);
+        tell(&Progress::new(Stage::Mirror, 0, total))?;
+        let mut stopped = Ok(());
+        let mut told = |done, stopped: &mut Result<(), Error>| {
+            *stopped = tell(&Progress::new(Stage::Mirror, done, total));
+            if stopped.is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+        };
+        if !self.settled {
+            let moved = quick_fit(&self.shown, config, 0, |p| told(p.step, &mut stopped))?;
+            stopped?;
+            stopped = Ok(());
+            let correction = frame_of(&moved, &self.shown)?;
+            self.correct(&correction);
+        }
+        let found = match self.shown.len() <= MOST_MIRRORED {
+            true => find_mirror(&self.shown, config, 0, |done| told(framing + done, &mut stopped))?,
+            false => None,
+        };
+        stopped?;
+        tell(&Progress::new(Stage::Mirror, total, total))?;
+        if let Some(FoundMirror { mirror, contradiction }) = found.filter(|f| f.contradiction <= f64::from(most)) {
+            let [x, y, z] = mirror.normal.to_array();
+            self.frame.notes.push(format!(
+                "the object is taken to be its own mirror image about the plane with normal ({x:.2}, {y:.2}, {z:.2}): mirrored photos are \
+                 further views (contradiction {contradiction:.2}, at most {most})"
+            ));
+            self.shown.extend(mirrored(&self.shown, &mirror));
+            self.canonical.extend(mirrored(&self.canonical, &mirror));
+        }
+        Ok(())
     }
 
     /// A quick fit for each member of the ensemble of each seed, `[members][seeds]`. The first of seed 0 moves frame and views, of
@@ -55,7 +100,7 @@ impl Placed {
     ) -> Result<Vec<Vec<Cloud>>, Error> {
         let of_members = |member| seeds.iter().map(move |seed| seed.wrapping_mul(MOST_MEMBERS).wrapping_add(member));
         let numbers: Vec<Vec<u64>> = (0..members as u64).map(|member| of_members(member).collect()).collect();
-        let framing = !self.frame.kept && !numbers.iter().flatten().any(|&number| number == 0);
+        let framing = !self.settled && !numbers.iter().flatten().any(|&number| number == 0);
         let total = (members * seeds.len() + usize::from(framing)) * config.iterations;
         let mut done = 0;
         let mut fit = |views: &[View], place: Option<&Similarity>, number| {
@@ -67,7 +112,7 @@ impl Placed {
         };
         // The fit knows better than the masks where the object is; it moves along, so that one is enough.
         let mut first = None;
-        if !self.frame.kept {
+        if !self.settled {
             let mut moved = fit(&self.shown, Some(&self.frame.canonical_from_user), 0)?;
             let correction = frame_of(&moved, &self.shown)?;
             moved.transform(correction.scale, correction.rotation, correction.translation);
@@ -85,10 +130,14 @@ impl Placed {
         self.canonical = moved(&self.canonical, correction);
         self.shown = moved(&self.shown, correction);
         self.frame.canonical_from_user = correction.after(&self.frame.canonical_from_user);
+        self.settled = true;
         let (shift, scale) = (correction.translation.length(), correction.scale);
         self.frame.notes.push(format!("the quick fit moved it by {shift:.3} and scaled it by {scale:.3}"));
     }
 }
+
+/// Photos beyond which nothing is gained by mirrored ones: so many were measured, and the model is shown no more than twice as many.
+const MOST_MIRRORED: usize = 4;
 
 /// Numbers that the fits of one seed have for its members: as many as `sample.ensemble` allows.
 const MOST_MEMBERS: u64 = 64;

@@ -13,6 +13,8 @@ use crate::{Error, to_user};
 pub enum Stage {
     /// Finds where the object is.
     Frame,
+    /// Looks for the plane about which the object is its own mirror image.
+    Mirror,
     /// Fits Gaussians to the views quickly, for sampling to start from.
     Fit,
     /// Samples with the network; a sample from pure noise is polished and mended, too.
@@ -22,10 +24,11 @@ pub enum Stage {
 }
 
 impl Stage {
-    /// One word: `frame`, `fit`, `sample`, `refine`.
+    /// One word: `frame`, `mirror`, `fit`, `sample`, `refine`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Frame => "frame",
+            Self::Mirror => "mirror",
             Self::Fit => "fit",
             Self::Sample => "sample",
             Self::Refine => "refine",

@@ -146,12 +146,18 @@ impl Reconstructor {
 
         // Samples that nothing is made of have no use for others beside them.
         let members = if options.sample.refine > 0 { options.sample.ensemble } else { 1 };
+        if options.sample.mirror > 0.0 {
+            let begin = Instant::now();
+            let fit = options.sample.start.as_ref().map_or_else(QuickFitConfig::default, |start| start.fit.clone());
+            placed.mirror(&fit, options.sample.mirror, &mut tell)?;
+            seconds.push((Stage::Mirror, begin.elapsed().as_secs_f64()));
+        }
         let mut fits = Vec::new();
         if let Some(StartConfig { fit, .. }) = &options.sample.start {
             let begin = Instant::now();
             fits = placed.quick_fits(fit, &options.seeds, members, &mut tell)?;
             seconds.push((Stage::Fit, begin.elapsed().as_secs_f64()));
-        } else if options.sample.polish > 0 {
+        } else if options.sample.polish > 0 && options.sample.mirror == 0.0 {
             // What is polished begins elsewhere, but where the object is, a quick fit knows best there, too.
             let begin = Instant::now();
             placed.quick_fits(&QuickFitConfig::default(), &[0], 1, &mut tell)?;

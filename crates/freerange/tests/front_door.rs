@@ -24,6 +24,7 @@ fn short(model: &Reconstructor) -> Options {
     options.seeds = vec![4, 5];
     options.sample.refine = 4;
     options.sample.ensemble = 1;
+    options.sample.mirror = 0.0;
     options
 }
 
@@ -138,6 +139,51 @@ fn an_ensemble_is_refined_together() {
     assert_eq!(alone.samples[0].unrefined, together.samples[0].unrefined);
     assert_ne!(alone.samples[0].gaussians, together.samples[0].gaussians);
     assert_eq!(alone.canonical_from_user, together.canonical_from_user);
+}
+
+/// A bowl is its own mirror image: mirrored photos are shown, and the user is told so.
+#[test]
+fn mirrored_photos_are_further_views() {
+    let model = model();
+    let views = bowl();
+    let mut options = short(&model);
+    options.seeds.truncate(1);
+    let run = |options: &freerange::Options| {
+        let mut told = Vec::new();
+        let made = model.run(&views, options, &mut |p| {
+            told.push((p.stage, p.done, p.total));
+            ControlFlow::Continue(())
+        });
+        (made.unwrap(), told)
+    };
+    let (without, _) = run(&options);
+    let noted = |made: &freerange::Reconstruction| made.notes.iter().any(|note| note.contains("mirror image"));
+    options.sample.mirror = 1e-6;
+    let (contradicted, _) = run(&options);
+    options.sample.mirror = 100.0;
+    let (with, told) = run(&options);
+    assert_eq!([&without, &contradicted, &with].map(noted), [false, false, true]);
+    assert_eq!(with.shown, without.shown);
+    assert_ne!(with.samples[0].gaussians, without.samples[0].gaussians);
+    let steps: Vec<_> = told.iter().filter(|t| t.0 == Stage::Mirror).collect();
+    let (first, last) = (steps[0], steps[steps.len() - 1]);
+    assert!(
+        first.1 == 0 && last.1 == last.2 && steps.windows(2).all(|pair| pair[0].1 <= pair[1].1),
+        "{first:?} {last:?}"
+    );
+    assert!(told.windows(2).all(|pair| pair[0].0 <= pair[1].0), "stages come in their order");
+
+    for last in [0, 5] {
+        let mut after = 0;
+        let stopped = model.run(&views, &options, &mut |p| {
+            after += usize::from(after > 0);
+            if (p.stage, p.done) == (Stage::Mirror, last) {
+                after = 1;
+            }
+            if after > 0 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        });
+        assert!(matches!(stopped, Err(Error::Cancelled)) && after == 1, "{last}: told {after} times");
+    }
 }
 
 /// From pure noise; what is mended or polished starts from that sample and stays near it.

@@ -105,6 +105,10 @@ pub struct Sampling {
     /// [default: the checkpoint's].
     #[arg(long, value_name = "STEPS")]
     pub regroup: Option<usize>,
+    /// Take photos mirrored about the object's plane of symmetry as further input views where, by a fit of both, they contradict the
+    /// photos by at most so much; 0 is never, 0.95 where they agree [default: the checkpoint's].
+    #[arg(long, value_name = "MOST")]
+    pub mirror: Option<f32>,
     /// Seed of the (first) sample.
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
@@ -198,6 +202,7 @@ impl Sampling {
         sample.polish = self.polish.unwrap_or(sample.polish);
         sample.mend = self.mend.unwrap_or(sample.mend);
         sample.regroup = self.regroup.unwrap_or(sample.regroup);
+        sample.mirror = self.mirror.unwrap_or(sample.mirror);
         sample.ensemble = self.ensemble.map_or(sample.ensemble, usize::from);
         options.seeds = (0..u64::from(samples)).map(|i| self.seed.wrapping_add(i)).collect();
         options.frame.up = self.up.or_z();
@@ -215,6 +220,7 @@ struct Watch {
 impl Watch {
     fn at(&mut self, told: &freerange::Progress<'_>) {
         let label = match told.stage {
+            Stage::Mirror => "looking for symmetry",
             Stage::Fit => "fitting",
             Stage::Sample => "sampling",
             Stage::Refine => "refining",

@@ -50,6 +50,11 @@ pub struct SampleConfig {
     pub coupling: Coupling,
     /// Arithmetic of the transformer's blocks.
     pub compute: Compute,
+    /// Most that photos mirrored about the object's plane of symmetry may [contradict](freerange_fit::FoundMirror::contradiction) the
+    /// photos to be further input views of everything that follows. 0: none are looked for.
+    /// [`reconstruct`](super::reconstruct) itself takes what it is given.
+    #[serde(skip_serializing_if = "is_nothing")]
+    pub mirror: f32,
     /// Steps of 3DGS-MCMC on the input views that follow ([`freerange_fit::refine`]); [`reconstruct`](super::reconstruct)
     /// itself takes none.
     pub refine: usize,
@@ -117,6 +122,7 @@ impl Default for SampleConfig {
             background: Background::Random,
             coupling: Coupling::Independent,
             compute: Compute::F32,
+            mirror: 0.0,
             refine: 0,
             ensemble: 1,
             polish: 0,
@@ -132,6 +138,10 @@ fn is_random(background: &Background) -> bool {
 
 fn is_zero(x: &usize) -> bool {
     *x == 0
+}
+
+fn is_nothing(x: &f32) -> bool {
+    *x == 0.0
 }
 
 fn is_one(x: &usize) -> bool {
@@ -176,6 +186,9 @@ impl SampleConfig {
         }
         if self.mend > 10_000 {
             return bad("mend", "0 to 10000", self.mend.to_string());
+        }
+        if !(0.0..=100.0).contains(&self.mirror) {
+            return bad("mirror", "0 to 100", self.mirror.to_string());
         }
         if self.refine > 100_000 {
             return bad("refine", "0 to 100000", self.refine.to_string());

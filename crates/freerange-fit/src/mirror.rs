@@ -1,0 +1,434 @@
+//! Planes about which an object is its own mirror image: each photo is then one more, from where nobody stood.
+
+use std::{f64::consts::PI, ops::ControlFlow};
+
+use freerange_camera::{Camera, View};
+use freerange_raster::render;
+use freerange_splat::Cloud;
+use glam::{DMat3, DMat4, DVec3};
+use image::imageops::flip_horizontal;
+
+use crate::{FitError, FitProgress, QuickFitConfig, polish, quick_fit, views::Targets};
+
+/// A plane: the points p with `normal . p = offset`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Mirror {
+    /// Of unit length.
+    pub normal: DVec3,
+    /// Signed distance from the origin.
+    pub offset: f64,
+}
+
+impl Mirror {
+    /// The point on the other side.
+    pub fn point(&self, p: DVec3) -> DVec3 {
+        p - 2.0 * (self.normal.dot(p) - self.offset) * self.normal
+    }
+
+    /// The same view from the other side, of an object that is its own mirror image: the picture is mirrored, too.
+    pub fn view(&self, view: &View) -> View {
+        let name = format!("{} mirrored", view.name);
+        View { name, camera: self.camera(&view.camera), image: flip_horizontal(&view.image) }
+    }
+
+    /// The camera of that view.
+    fn camera(&self, camera: &Camera) -> Camera {
+        let axes = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| axis - 2.0 * self.normal.dot(axis) * self.normal);
+        let shift = 2.0 * self.offset * self.normal;
+        let reflection = DMat4::from_mat3(DMat3::from_cols(axes[0], axes[1], axes[2]));
+        let reflection = DMat4::from_translation(shift) * reflection;
+        // Mirrored twice, the camera is one again.
+        let flip = DMat4::from_scale(DVec3::new(-1.0, 1.0, 1.0));
+        let world_to_camera = flip * camera.world_to_camera * reflection;
+        Camera { cx: f64::from(camera.width) - camera.cx, world_to_camera, ..*camera }
+    }
+
+    fn moved(&self, turn: [f64; 2], shift: f64) -> Self {
+        let a = self.normal.any_orthonormal_vector();
+        let b = self.normal.cross(a);
+        let normal = (self.normal + turn[0] * a + turn[1] * b).normalize();
+        Self { normal, offset: self.offset + shift }
+    }
+}
+
+/// A plane that the photos allow.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FoundMirror {
+    /// The plane.
+    pub mirror: Mirror,
+    /// How unlike the photos a fit of them together with the mirrored ones is, as a part of how unlike a fit of them alone is. It has
+    /// had twice the steps: below 1 where mirrored photos agree with the photos, twice that and more where they do not.
+    pub contradiction: f64,
+}
+
+/// Longest side, in pixels, of the outlines that planes are judged by.
+const OUTLINE: u32 = 64;
+/// Longest side, in pixels, of the pictures that they are judged by.
+const PICTURE: u32 = 128;
+/// Cells along each side of the cube of the visual hull.
+const CELLS: usize = 44;
+/// Half the side of that cube: a little more than the radius of an object in the canonical frame.
+const HALF: f64 = 0.52;
+/// Part of the outlines that what photos and mirrored photos leave of the hull may not fill.
+const UNCOVERED: f64 = 0.01;
+/// Planes whose normals are closer than this, in radians, are one.
+const APART: f64 = 0.2;
+/// Least cosine of the angle between a mirrored photo's direction and the nearest photo's, mean over the photos: where they share nothing,
+/// they cannot contradict each other.
+const BESIDE: f64 = 0.5;
+/// Planes that are put in their place by a fit of the photos alone.
+const PLACED: usize = 6;
+/// Planes that are fitted to.
+const FITTED: usize = 3;
+/// How often a fitted plane is put in its place by its own fit, and the fit goes on.
+const ROUNDS: usize = 3;
+
+/// How many steps [`find_mirror`] tells of.
+pub fn mirror_steps(config: &QuickFitConfig) -> usize {
+    config.iterations + FITTED * (config.iterations + ROUNDS * going_on(config).iterations)
+}
+
+/// The plane about which an object is its own mirror image, as far as photos of it tell: none where no plane suits their outlines.
+/// `views` lie in the canonical frame.
+///
+/// Three questions, each asked of fewer planes than the one before. Can what lies within all outlines and within all mirrored ones fill the outlines?
+/// (All directions, fifteen degrees apart, but for those from which mirrored photos share nothing with the photos.) From behind which of these planes does a quick fit of the photos look most like them? And how much do photos
+/// and mirrored photos contradict each other, in a fit of both that moves the plane as well?
+/// `progress` hears how many of [`mirror_steps`] are done, and ends the search, with none, by `ControlFlow::Break`.
+///
+/// # Errors
+/// Those of [`fit`](crate::fit()).
+pub fn find_mirror(
+    views: &[View],
+    config: &QuickFitConfig,
+    seed: u64,
+    mut progress: impl FnMut(usize) -> ControlFlow<()>,
+) -> Result<Option<FoundMirror>, FitError> {
+    config.check()?;
+    let planes = Hull::new(&Targets::new(views, Some(OUTLINE))?).planes();
+    let pictures = Targets::new(views, Some(PICTURE))?;
+    let mut done = 0;
+    // None where it was ended.
+    let mut fitted = |start: Option<&Cloud>, views: &[View], config: &QuickFitConfig| {
+        let mut ended = false;
+        let tell = |p: &FitProgress<'_>| {
+            let told = progress(done + p.step);
+            ended = told.is_break();
+            told
+        };
+        let cloud = match start {
+            None => quick_fit(views, config, seed, tell)?,
+            Some(start) => polish(start, views, config, seed, tell)?,
+        };
+        done += config.iterations;
+        Ok::<_, FitError>((!ended).then_some(cloud))
+    };
+
+    let Some(own) = fitted(None, views, config)? else { return Ok(None) };
+    let mut judged = Vec::with_capacity(planes.len());
+    for plane in planes {
+        judged.push((difference(&own, &pictures, Some(&plane))?, plane));
+    }
+    let mut placed = Vec::with_capacity(PLACED);
+    for (_, plane) in best(judged, PLACED) {
+        placed.push(place(&own, &pictures, plane, 0.04)?);
+    }
+    let before = difference(&own, &pictures, None)?;
+    let mut found: Option<FoundMirror> = None;
+    for (_, mut plane) in best(placed, FITTED) {
+        let both = |plane: &Mirror| [views, &mirrored(views, plane)[..]].concat();
+        let Some(mut cloud) = fitted(None, &both(&plane), config)? else { return Ok(None) };
+        for _ in 0..ROUNDS {
+            (_, plane) = place(&cloud, &pictures, plane, 0.01)?;
+            let Some(next) = fitted(Some(&cloud), &both(&plane), &going_on(config))? else { return Ok(None) };
+            cloud = next;
+        }
+        let contradiction = difference(&cloud, &pictures, None)? / before.max(f64::MIN_POSITIVE);
+        if found.is_none_or(|found| contradiction < found.contradiction) {
+            found = Some(FoundMirror { mirror: plane, contradiction });
+        }
+    }
+    Ok(found)
+}
+
+/// A third of a fit.
+fn going_on(config: &QuickFitConfig) -> QuickFitConfig {
+    QuickFitConfig { iterations: config.iterations.div_ceil(ROUNDS), ..config.clone() }
+}
+
+/// At most `most` of the planes, those of the smallest values, no two of which are one.
+fn best(mut planes: Vec<(f64, Mirror)>, most: usize) -> Vec<(f64, Mirror)> {
+    planes.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let mut chosen: Vec<(f64, Mirror)> = Vec::with_capacity(most);
+    for plane in planes {
+        if chosen.len() < most && chosen.iter().all(|c| c.1.normal.dot(plane.1.normal).abs() < APART.cos()) {
+            chosen.push(plane);
+        }
+    }
+    chosen
+}
+
+/// The views from behind the mirror.
+pub fn mirrored(views: &[View], mirror: &Mirror) -> Vec<View> {
+    views.iter().map(|view| mirror.view(view)).collect()
+}
+
+/// The plane near `plane` from behind which `cloud` looks most like the `views`, and how unlike they are. Turns and shifts begin with
+/// `reach`, in radians and, half of it, in the object's units.
+fn place(cloud: &Cloud, views: &Targets, plane: Mirror, reach: f64) -> Result<(f64, Mirror), FitError> {
+    const LEAST: f64 = 0.001;
+    let value = |plane: &Mirror| difference(cloud, views, Some(plane));
+    let mut best = (value(&plane)?, plane);
+    let mut step = reach;
+    while step > LEAST {
+        let mut better = false;
+        for (turn, shift) in [([1.0, 0.0], 0.0), ([0.0, 1.0], 0.0), ([0.0, 0.0], 0.5)] {
+            for sign in [-step, step] {
+                let next = best.1.moved(turn.map(|t| t * sign), shift * sign);
+                let found = value(&next)?;
+                if found < best.0 {
+                    best = (found, next);
+                    better = true;
+                    break;
+                }
+            }
+        }
+        if !better {
+            step *= 0.5;
+        }
+    }
+    Ok(best)
+}
+
+/// Mean absolute difference between a cloud and views of it, or what these are from behind a mirror: of colour times alpha, plus that of alpha.
+fn difference(cloud: &Cloud, targets: &Targets, mirror: Option<&Mirror>) -> Result<f64, FitError> {
+    let all: Vec<usize> = (0..targets.cameras.len()).collect();
+    let (mut sum, mut count) = (0.0, 0u32);
+    for (group, raster) in targets.groups(&all) {
+        let own = group.iter().map(|&i| targets.cameras[i]);
+        let cameras: Vec<_> = own.map(|camera| mirror.map_or(camera, |mirror| mirror.camera(&camera))).collect();
+        let output = render(cloud.rows(), &cameras, &vec![[0.0; 3]; group.len()], raster)?;
+        let (width, height) = targets.size(group[0]);
+        let rendered = output.rgb.as_chunks::<3>().0.iter().zip(&output.alpha);
+        for (index, (rgb, alpha)) in rendered.enumerate() {
+            let (image, y, x) = (group[index / (width * height)], index / width % height, index % width);
+            let x = if mirror.is_some() { width - 1 - x } else { x };
+            let [r, g, b, a] = targets.images[image].get_pixel(x as u32, y as u32).0.map(|v| f32::from(v) / 255.0);
+            let color = (rgb[0] - a * r).abs() + (rgb[1] - a * g).abs() + (rgb[2] - a * b).abs();
+            sum += f64::from(color / 3.0 + (alpha - a).abs());
+            count += 1;
+        }
+    }
+    Ok(sum / f64::from(count.max(1)))
+}
+
+/// What lies within the outlines of all views.
+struct Hull<'a> {
+    targets: &'a Targets,
+    cells: Vec<bool>,         // [CELLS, CELLS, CELLS]
+    points: Vec<DVec3>,       // of the cells within
+    pixels: Vec<Vec<usize>>,  // which pixel of each view shows them
+    outlines: Vec<Vec<bool>>, // what each view shows of the object
+}
+
+impl<'a> Hull<'a> {
+    fn new(targets: &'a Targets) -> Self {
+        let outlines: Vec<Vec<bool>> =
+            targets.images.iter().map(|image| image.pixels().map(|p| p[3] >= 128).collect()).collect();
+        let grown: Vec<Vec<bool>> = (0..outlines.len()).map(|i| grown(&outlines[i], targets.size(i))).collect();
+        let mut hull =
+            Self { targets, cells: vec![false; CELLS.pow(3)], points: Vec::new(), pixels: Vec::new(), outlines };
+        let place = |i: usize| ((i as f64 + 0.5) / CELLS as f64 * 2.0 - 1.0) * HALF;
+        for (index, cell) in hull.cells.iter_mut().enumerate() {
+            let at = [index / (CELLS * CELLS), index / CELLS % CELLS, index % CELLS];
+            let point = DVec3::from_array(at.map(place));
+            *cell = (0..grown.len()).all(|i| pixel(targets, i, point).is_some_and(|p| grown[i][p]));
+            if *cell {
+                hull.points.push(point);
+            }
+        }
+        let pixels = |i| hull.points.iter().map(|&p| pixel(targets, i, p).expect("within the hull")).collect();
+        hull.pixels = (0..targets.images.len()).map(pixels).collect();
+        hull
+    }
+
+    /// Planes whose mirrored outlines leave enough of the hull to fill the outlines.
+    fn planes(&self) -> Vec<Mirror> {
+        let mut planes = Vec::new();
+        if self.points.is_empty() {
+            return planes;
+        }
+        for normal in normals().into_iter().filter(|&normal| beside(self.targets, normal) >= BESIDE) {
+            let along = self.points.iter().map(|p| p.dot(normal));
+            let (low, high) = along.fold((f64::MAX, f64::MIN), |(l, h), x| (l.min(x), h.max(x)));
+            for shift in -4..=4 {
+                let plane = Mirror { normal, offset: 0.5 * (low + high) + 0.02 * f64::from(shift) };
+                if self.uncovered(&plane) <= UNCOVERED {
+                    planes.push(plane);
+                }
+            }
+        }
+        planes
+    }
+
+    fn uncovered(&self, plane: &Mirror) -> f64 {
+        let mut covered: Vec<Vec<bool>> = self.outlines.iter().map(|o| vec![false; o.len()]).collect();
+        for (i, &point) in self.points.iter().enumerate() {
+            let at = (plane.point(point) / HALF + 1.0) * (0.5 * CELLS as f64);
+            let within = at.min_element() >= 0.0 && at.max_element() < CELLS as f64;
+            if within && self.cells[(at.x as usize * CELLS + at.y as usize) * CELLS + at.z as usize] {
+                covered.iter_mut().zip(&self.pixels).for_each(|(covered, pixels)| covered[pixels[i]] = true);
+            }
+        }
+        let (mut all, mut lost) = (0, 0);
+        for (i, outline) in self.outlines.iter().enumerate() {
+            let covered = grown(&covered[i], self.targets.size(i));
+            all += outline.iter().filter(|o| **o).count();
+            lost += outline.iter().zip(covered).filter(|(o, c)| **o && !c).count();
+        }
+        lost as f64 / all.max(1) as f64
+    }
+}
+
+/// How near mirrored photos are to the photos: see [`BESIDE`].
+fn beside(targets: &Targets, normal: DVec3) -> f64 {
+    let directions: Vec<DVec3> = targets.cameras.iter().map(|c| c.center().normalize_or_zero()).collect();
+    let through = Mirror { normal, offset: 0.0 };
+    let nearest = |d: DVec3| directions.iter().map(|other| other.dot(through.point(d))).fold(-1.0, f64::max);
+    directions.iter().map(|&d| nearest(d)).sum::<f64>() / directions.len() as f64
+}
+
+/// Half a sphere of directions, fifteen degrees apart.
+fn normals() -> Vec<DVec3> {
+    let mut all = Vec::new();
+    for row in 0..=6 {
+        let elevation = f64::from(row) * PI / 12.0;
+        let count = if row == 6 { 1 } else { (24.0 * elevation.cos()).round() as usize };
+        let (count, turn) = if row == 0 { (12, PI) } else { (count, 2.0 * PI) };
+        for i in 0..count {
+            let azimuth = turn * i as f64 / count as f64;
+            all.push(DVec3::new(azimuth.cos() * elevation.cos(), azimuth.sin() * elevation.cos(), elevation.sin()));
+        }
+    }
+    all
+}
+
+/// The pixel of view `i` that shows `point`.
+fn pixel(targets: &Targets, i: usize, point: DVec3) -> Option<usize> {
+    let c = &targets.cameras[i];
+    let p = c.world_to_camera.transform_point3(point);
+    let (x, y) = (c.fx * p.x / p.z + c.cx, c.fy * p.y / p.z + c.cy);
+    let (width, height) = targets.size(i);
+    let inside = p.z > 0.0 && x >= 0.0 && y >= 0.0 && x < width as f64 && y < height as f64;
+    inside.then(|| y as usize * width + x as usize)
+}
+
+/// A mask and the pixels beside it.
+fn grown(mask: &[bool], (width, height): (usize, usize)) -> Vec<bool> {
+    let mut out = mask.to_vec();
+    for y in 0..height {
+        for x in 0..width {
+            let i = y * width + x;
+            if mask[i] {
+                (x > 0).then(|| out[i - 1] = true);
+                (x + 1 < width).then(|| out[i + 1] = true);
+                (y > 0).then(|| out[i - width] = true);
+                (y + 1 < height).then(|| out[i + width] = true);
+            }
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tests::{ball, cameras, photograph};
+    use freerange_splat::channel;
+
+    /// Round Gaussians, so that turning them is no matter.
+    fn round(n: usize, seed: u64) -> Cloud {
+        let mut cloud = ball(n, seed);
+        for row in cloud.iter_mut() {
+            row[channel::LOG_SCALE].fill(-2.4);
+            row[channel::LOGIT_OPACITY] = 4.0;
+        }
+        cloud
+    }
+
+    fn behind(cloud: &Cloud, mirror: &Mirror) -> Cloud {
+        let mut cloud = cloud.clone();
+        for row in cloud.iter_mut() {
+            let mean = DVec3::from_array([0, 1, 2].map(|i| f64::from(row[channel::MEAN.start + i])));
+            row[channel::MEAN].copy_from_slice(&mirror.point(mean).as_vec3().to_array());
+        }
+        cloud
+    }
+
+    /// Its own mirror image.
+    fn twins(n: usize, seed: u64, mirror: &Mirror) -> Cloud {
+        let half = round(n, seed);
+        let both = half.iter().chain(behind(&half, mirror).iter()).copied().collect::<Vec<_>>();
+        Cloud::from_rows(both.into_iter().flatten().collect())
+    }
+
+    fn photos(cloud: &Cloud) -> Vec<View> {
+        cameras(4, 64, 0.3).iter().map(|c| photograph(cloud, c)).collect()
+    }
+
+    const MIRROR: Mirror = Mirror { normal: DVec3::new(0.6, 0.64, 0.48), offset: 0.05 };
+
+    #[test]
+    fn a_mirrored_photo_is_one_of_the_mirrored_object() {
+        let cloud = round(12, 5);
+        let mut camera = cameras(3, 40, 0.0)[1];
+        camera.cx += 1.5;
+        let seen = MIRROR.view(&photograph(&cloud, &camera));
+        let rotation = DMat3::from_mat4(seen.camera.world_to_camera);
+        assert!((rotation.determinant() - 1.0).abs() < 1e-12, "a camera is never mirrored");
+        assert!(seen.camera.center().abs_diff_eq(MIRROR.point(camera.center()), 1e-12));
+        let made = photograph(&behind(&cloud, &MIRROR), &seen.camera);
+        let solid =
+            |view: &View| view.image.pixels().map(|p| p.0.map(|v| i32::from(v) * i32::from(p[3]) / 255)).collect();
+        let (seen, made): (Vec<_>, Vec<_>) = (solid(&seen), solid(&made));
+        let apart = |(a, b): (&[i32; 4], &[i32; 4])| (0..4).map(|i| (a[i] - b[i]).abs()).max().unwrap();
+        let worst = seen.iter().zip(&made).map(apart).max().unwrap();
+        assert!(worst <= 2, "{worst} of 255");
+        assert!(MIRROR.point(MIRROR.point(DVec3::new(0.1, 0.2, -0.3))).abs_diff_eq(DVec3::new(0.1, 0.2, -0.3), 1e-12));
+    }
+
+    #[test]
+    fn what_is_its_own_mirror_image_is_told_from_what_is_not() {
+        let config = QuickFitConfig { iterations: 120, gaussians: 150, render_size: 64 };
+        let find =
+            |cloud: &Cloud| find_mirror(&photos(cloud), &config, 0, |_| ControlFlow::Continue(())).unwrap().unwrap();
+        let found = find(&twins(20, 3, &MIRROR));
+        let (normal, side) = (found.mirror.normal, found.mirror.normal.dot(MIRROR.normal).signum());
+        assert!(normal.angle_between(side * MIRROR.normal) < 0.06, "{found:?}");
+        assert!((side * found.mirror.offset - MIRROR.offset).abs() < 0.02, "{found:?}");
+        let other = find(&round(40, 7));
+        assert!(other.contradiction > 1.3 * found.contradiction, "{other:?} {found:?}");
+    }
+
+    #[test]
+    fn the_search_is_told_of_and_ends_where_it_is_told_to() {
+        let config = QuickFitConfig { iterations: 7, gaussians: 30, render_size: 32 };
+        let views = photos(&twins(10, 3, &MIRROR));
+        let mut told = Vec::new();
+        find_mirror(&views, &config, 0, |done| {
+            told.push(done);
+            ControlFlow::Continue(())
+        })
+        .unwrap();
+        assert!(told.iter().copied().eq(1..=told.len()) && told.len() <= mirror_steps(&config), "{told:?}");
+        for last in [1, 9, 16] {
+            let mut reached = 0;
+            let found = find_mirror(&views, &config, 0, |done| {
+                reached = done;
+                if done == last { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+            });
+            assert!(found.unwrap().is_none() && reached == last, "{last}: {reached}");
+        }
+        assert!(find_mirror(&[], &config, 0, |_| ControlFlow::Continue(())).is_err());
+    }
+}
