@@ -63,12 +63,12 @@ def test_the_result_looks_like_the_images(model, bowl):
     assert pictures.shape == (4, h, w, 3) and pictures.dtype == np.float32
     assert min(psnr(p, over_white(i)) for p, i in zip(pictures, images)) > 30.0
     stages = [step.stage for step in steps]
-    assert [s for i, s in enumerate(stages) if i == 0 or stages[i - 1] != s] == ["frame", "fit", "sample", "refine"]
+    assert [s for i, s in enumerate(stages) if i == 0 or stages[i - 1] != s] == ["frame", "mirror", "fit", "sample", "refine"]
     last = steps[-1]
     assert (last.done, last.total) == (100, 100) and last.loss > 0.0 and len(last.gaussians) == 1
     assert np.array_equal(last.gaussians[0].means, gaussians.means)
     assert len([s for s in steps if s.stage == "sample" and s.gaussians]) == last_sample(steps)
-    assert set(gaussians.seconds) == {"frame", "fit", "sample", "refine"} and gaussians.seed == 0
+    assert set(gaussians.seconds) == {"frame", "mirror", "fit", "sample", "refine"} and gaussians.seed == 0
 
 
 def last_sample(steps):

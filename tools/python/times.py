@@ -9,7 +9,7 @@ from pathlib import Path
 
 import freerange
 
-STAGES = ("frame", "fit", "sample", "refine")
+STAGES = ("frame", "mirror", "fit", "sample", "refine")
 
 
 def main() -> None:

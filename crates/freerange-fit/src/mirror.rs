@@ -76,6 +76,9 @@ const APART: f64 = 0.2;
 /// Least cosine of the angle between a mirrored photo's direction and the nearest photo's, mean over the photos: where they share nothing,
 /// they cannot contradict each other.
 const BESIDE: f64 = 0.5;
+/// Longest mean of the directions towards the cameras, as unit vectors: photos from one side do not tell how deep the object is, and so not
+/// where a plane lies.
+const ONE_SIDED: f64 = 0.75;
 /// Planes that are put in their place by a fit of the photos alone.
 const PLACED: usize = 6;
 /// Planes that are fitted to.
@@ -88,7 +91,8 @@ pub fn mirror_steps(config: &QuickFitConfig) -> usize {
     config.iterations + FITTED * (config.iterations + ROUNDS * going_on(config).iterations)
 }
 
-/// The plane about which an object is its own mirror image, as far as photos of it tell: none where no plane suits their outlines.
+/// The plane about which an object is its own mirror image, as far as photos of it tell: none where no plane suits their outlines, or they are all
+/// from one side.
 /// `views` lie in the canonical frame.
 ///
 /// Three questions, each asked of fewer planes than the one before. Can what lies within all outlines and within all mirrored ones fill the outlines?
@@ -255,7 +259,7 @@ impl<'a> Hull<'a> {
     /// Planes whose mirrored outlines leave enough of the hull to fill the outlines.
     fn planes(&self) -> Vec<Mirror> {
         let mut planes = Vec::new();
-        if self.points.is_empty() {
+        if self.points.is_empty() || one_sided(self.targets) {
             return planes;
         }
         for normal in normals().into_iter().filter(|&normal| beside(self.targets, normal) >= BESIDE) {
@@ -290,9 +294,18 @@ impl<'a> Hull<'a> {
     }
 }
 
+fn directions(targets: &Targets) -> Vec<DVec3> {
+    targets.cameras.iter().map(|c| c.center().normalize_or_zero()).collect()
+}
+
+fn one_sided(targets: &Targets) -> bool {
+    let directions = directions(targets);
+    directions.iter().sum::<DVec3>().length() > ONE_SIDED * directions.len() as f64
+}
+
 /// How near mirrored photos are to the photos: see [`BESIDE`].
 fn beside(targets: &Targets, normal: DVec3) -> f64 {
-    let directions: Vec<DVec3> = targets.cameras.iter().map(|c| c.center().normalize_or_zero()).collect();
+    let directions = directions(targets);
     let through = Mirror { normal, offset: 0.0 };
     let nearest = |d: DVec3| directions.iter().map(|other| other.dot(through.point(d))).fold(-1.0, f64::max);
     directions.iter().map(|&d| nearest(d)).sum::<f64>() / directions.len() as f64

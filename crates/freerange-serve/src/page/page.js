@@ -345,7 +345,7 @@
 
   // --- One job ---------------------------------------------------------------------------------------------------------
 
-  const WORDS = { frame: "finding the object", fit: "fitting quickly", sample: "sampling", refine: "refining on the photos" };
+  const WORDS = { frame: "finding the object", mirror: "looking for symmetry", fit: "fitting quickly", sample: "sampling", refine: "refining on the photos" };
 
   /** @param {Status} s */
   const sentence = (s) => {
