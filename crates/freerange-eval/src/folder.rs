@@ -7,6 +7,8 @@ use std::{
     fs,
     io::Write,
     path::{Path, PathBuf},
+    thread,
+    time::Duration,
 };
 
 use freerange_core::{IoError, write_atomically};
@@ -37,31 +39,31 @@ impl RunFolder {
     pub fn open(path: &Path, settings: &Value, restart: bool) -> Result<Self, EvalError> {
         let folder = Self { path: path.into() };
         let file = path.join(SETTINGS);
-        if !file.is_file() {
-            let mut entries = match fs::read_dir(path) {
-                Ok(entries) => entries,
-                Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
-                    fs::create_dir_all(path).map_err(IoError::at(path))?;
-                    fs::read_dir(path).map_err(IoError::at(path))?
-                }
-                Err(e) => return Err(IoError::at(path)(e).into()),
-            };
-            if let Some(Ok(entry)) = entries.next() {
-                let found = format!("{:?} and no {SETTINGS}", entry.file_name());
+        fs::create_dir_all(path).map_err(IoError::at(path))?;
+        // Shares that start together see each other's first files: what belongs to one soon has settings beside it.
+        let mut waits = 20;
+        while !file.is_file()
+            && let Some(entry) = fs::read_dir(path).map_err(IoError::at(path))?.next()
+        {
+            if waits == 0 {
+                let found = format!("{:?} and no {SETTINGS}", entry.map_err(IoError::at(path))?.file_name());
                 return Err(EvalError::file(path, "an empty folder or that of an earlier run", found));
             }
-        } else if restart {
+            waits -= 1;
+            thread::sleep(Duration::from_millis(50));
+        }
+        if file.is_file() && restart {
             folder.clear()?;
-        } else {
+        } else if file.is_file() {
             let earlier: Value = read_json(&file)?;
             let differences = differences(&earlier, settings);
             if !differences.is_empty() {
                 return Err(EvalError::Settings { path: path.into(), differences });
             }
         }
+        folder.write_json(SETTINGS, settings)?;
         let objects = path.join(OBJECTS);
         fs::create_dir_all(&objects).map_err(IoError::at(&objects))?;
-        folder.write_json(SETTINGS, settings)?;
         Ok(folder)
     }
 
@@ -259,6 +261,24 @@ mod tests {
         let fresh = RunFolder::open(&path, &other, true).unwrap();
         assert_eq!(fresh.record(&failed("a").case).unwrap(), None);
         assert_eq!(fs::read_to_string(path.join("mine.txt")).unwrap(), "mine");
+    }
+
+    #[test]
+    fn shares_may_start_at_once() {
+        let place = tempfile::tempdir().unwrap();
+        for round in 0..20 {
+            let path = place.path().join(round.to_string());
+            let start = std::sync::Barrier::new(6);
+            let open = || {
+                start.wait();
+                RunFolder::open(&path, &json!({ "method": "model" }), false).map(|_| ())
+            };
+            thread::scope(|scope| {
+                let all: Vec<_> = (0..6).map(|_| scope.spawn(open)).collect();
+                all.into_iter().for_each(|share| share.join().unwrap().unwrap());
+            });
+            assert!(path.join(OBJECTS).is_dir() && path.join(SETTINGS).is_file());
+        }
     }
 
     #[test]
