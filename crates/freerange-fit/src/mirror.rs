@@ -7,6 +7,7 @@ use freerange_raster::render;
 use freerange_splat::Cloud;
 use glam::{DMat3, DMat4, DVec3};
 use image::imageops::flip_horizontal;
+use rayon::prelude::*;
 
 use crate::{FitError, FitProgress, QuickFitConfig, polish, quick_fit, views::Targets};
 
@@ -129,14 +130,10 @@ pub fn find_mirror(
     };
 
     let Some(own) = fitted(None, views, config)? else { return Ok(None) };
-    let mut judged = Vec::with_capacity(planes.len());
-    for plane in planes {
-        judged.push((difference(&own, &pictures, Some(&plane))?, plane));
-    }
-    let mut placed = Vec::with_capacity(PLACED);
-    for (_, plane) in best(judged, PLACED) {
-        placed.push(place(&own, &pictures, plane, 0.04)?);
-    }
+    let judged = planes.into_par_iter().map(|plane| Ok((difference(&own, &pictures, Some(&plane))?, plane)));
+    let judged = best(judged.collect::<Result<_, FitError>>()?, PLACED);
+    let placed = judged.into_par_iter().map(|(_, plane)| place(&own, &pictures, plane, 0.04));
+    let placed = placed.collect::<Result<_, FitError>>()?;
     let before = difference(&own, &pictures, None)?;
     let mut found: Option<FoundMirror> = None;
     for (_, mut plane) in best(placed, FITTED) {
