@@ -19,7 +19,7 @@ from ._scene import Scene
 class Step:
     """How far a reconstruction has come."""
 
-    #: "frame", "fit", "sample" or "refine", in this order.
+    #: "frame", "mirror", "fit", "sample" or "refine", in this order; "mirror" where mirrored photos are looked for.
     stage: str
     #: Which of the samples, where they are worked on one after the other: in "refine".
     sample: int
@@ -30,7 +30,7 @@ class Step:
     #: The photometric loss of the last step of a fit, of polishing or of a refinement.
     loss: float | None
     #: What is known of the Gaussians by now, in your cameras' frame: of each sample in "sample", else one. Empty when a stage
-    #: begins, while a sample is polished or mended, and where the work is on helpers of the first sample.
+    #: begins, in "mirror", while a sample is polished or mended, and where the work is on helpers of the first sample.
     gaussians: tuple[Gaussians, ...]
 
 
