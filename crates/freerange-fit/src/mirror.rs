@@ -87,6 +87,9 @@ const FITTED: usize = 3;
 /// How often a fitted plane is put in its place by its own fit, and the fit goes on.
 const ROUNDS: usize = 3;
 
+/// Planes that are judged at once.
+const TOGETHER: usize = 8;
+
 /// How many steps [`find_mirror`] tells of.
 pub fn mirror_steps(config: &QuickFitConfig) -> usize {
     config.iterations + FITTED * (config.iterations + ROUNDS * going_on(config).iterations)
@@ -99,7 +102,7 @@ pub fn mirror_steps(config: &QuickFitConfig) -> usize {
 /// Three questions, each asked of fewer planes than the one before. Can what lies within all outlines and within all mirrored ones fill the outlines?
 /// (All directions, fifteen degrees apart, but for those from which mirrored photos share nothing with the photos.) From behind which of these planes does a quick fit of the photos look most like them? And how much do photos
 /// and mirrored photos contradict each other, in a fit of both that moves the plane as well?
-/// `progress` hears how many of [`mirror_steps`] are done, and ends the search, with none, by `ControlFlow::Break`.
+/// `progress` hears how many of [`mirror_steps`] are done, of some more than once, and ends the search, with none, by `ControlFlow::Break`.
 ///
 /// # Errors
 /// Those of [`fit`](crate::fit()).
@@ -112,36 +115,20 @@ pub fn find_mirror(
     config.check()?;
     let planes = Hull::new(&Targets::new(views, Some(OUTLINE))?).planes();
     let pictures = Targets::new(views, Some(PICTURE))?;
-    let mut done = 0;
-    // None where it was ended.
-    let mut fitted = |start: Option<&Cloud>, views: &[View], config: &QuickFitConfig| {
-        let mut ended = false;
-        let tell = |p: &FitProgress<'_>| {
-            let told = progress(done + p.step);
-            ended = told.is_break();
-            told
-        };
-        let cloud = match start {
-            None => quick_fit(views, config, seed, tell)?,
-            Some(start) => polish(start, views, config, seed, tell)?,
-        };
-        done += config.iterations;
-        Ok::<_, FitError>((!ended).then_some(cloud))
-    };
-
-    let Some(own) = fitted(None, views, config)? else { return Ok(None) };
-    let judged = planes.into_par_iter().map(|plane| Ok((difference(&own, &pictures, Some(&plane))?, plane)));
-    let judged = best(judged.collect::<Result<_, FitError>>()?, PLACED);
-    let placed = judged.into_par_iter().map(|(_, plane)| place(&own, &pictures, plane, 0.04));
-    let placed = placed.collect::<Result<_, FitError>>()?;
+    let mut search = Search { progress: &mut progress, seed, done: 0 };
+    let Some(own) = search.fitted(None, views, config)? else { return Ok(None) };
+    let judge = |plane: Mirror| Ok((difference(&own, &pictures, Some(&plane))?, plane));
+    let Some(judged) = search.each(planes, judge)? else { return Ok(None) };
+    let judged: Vec<Mirror> = best(judged, PLACED).into_iter().map(|(_, plane)| plane).collect();
+    let Some(placed) = search.each(judged, |plane| place(&own, &pictures, plane, 0.04))? else { return Ok(None) };
     let before = difference(&own, &pictures, None)?;
     let mut found: Option<FoundMirror> = None;
     for (_, mut plane) in best(placed, FITTED) {
         let both = |plane: &Mirror| [views, &mirrored(views, plane)[..]].concat();
-        let Some(mut cloud) = fitted(None, &both(&plane), config)? else { return Ok(None) };
+        let Some(mut cloud) = search.fitted(None, &both(&plane), config)? else { return Ok(None) };
         for _ in 0..ROUNDS {
             (_, plane) = place(&cloud, &pictures, plane, 0.01)?;
-            let Some(next) = fitted(Some(&cloud), &both(&plane), &going_on(config))? else { return Ok(None) };
+            let Some(next) = search.fitted(Some(&cloud), &both(&plane), &going_on(config))? else { return Ok(None) };
             cloud = next;
         }
         let contradiction = difference(&cloud, &pictures, None)? / before.max(f64::MIN_POSITIVE);
@@ -150,6 +137,51 @@ pub fn find_mirror(
         }
     }
     Ok(found)
+}
+
+/// A search that tells how far it is. What it is asked for is none where it was ended.
+struct Search<'a, P> {
+    progress: &'a mut P,
+    seed: u64,
+    done: usize,
+}
+
+impl<P: FnMut(usize) -> ControlFlow<()>> Search<'_, P> {
+    fn fitted(
+        &mut self,
+        start: Option<&Cloud>,
+        views: &[View],
+        config: &QuickFitConfig,
+    ) -> Result<Option<Cloud>, FitError> {
+        let mut ended = false;
+        let tell = |p: &FitProgress<'_>| {
+            let told = (self.progress)(self.done + p.step);
+            ended = told.is_break();
+            told
+        };
+        let cloud = match start {
+            None => quick_fit(views, config, self.seed, tell)?,
+            Some(start) => polish(start, views, config, self.seed, tell)?,
+        };
+        self.done += config.iterations;
+        Ok((!ended).then_some(cloud))
+    }
+
+    /// What `judge` says of each plane. It is asked again and again whether to go on, without being further.
+    fn each(
+        &mut self,
+        planes: Vec<Mirror>,
+        judge: impl Fn(Mirror) -> Result<(f64, Mirror), FitError> + Sync,
+    ) -> Result<Option<Vec<(f64, Mirror)>>, FitError> {
+        let mut judged = Vec::with_capacity(planes.len());
+        for some in planes.chunks(TOGETHER) {
+            judged.extend(some.par_iter().map(|&plane| judge(plane)).collect::<Result<Vec<_>, _>>()?);
+            if (self.progress)(self.done).is_break() {
+                return Ok(None);
+            }
+        }
+        Ok(Some(judged))
+    }
 }
 
 /// A third of a fit.
@@ -430,6 +462,9 @@ mod tests {
             ControlFlow::Continue(())
         })
         .unwrap();
+        assert!(told.len() > told.iter().max().map_or(0, |&last| last), "planes are told of, too");
+        assert!(told.windows(2).all(|pair| pair[0] <= pair[1]), "{told:?}");
+        told.dedup();
         assert!(told.iter().copied().eq(1..=told.len()) && told.len() <= mirror_steps(&config), "{told:?}");
         for last in [1, 9, 16] {
             let mut reached = 0;
