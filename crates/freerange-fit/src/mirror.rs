@@ -275,12 +275,12 @@ impl<'a> Hull<'a> {
         for (index, cell) in hull.cells.iter_mut().enumerate() {
             let at = [index / (CELLS * CELLS), index / CELLS % CELLS, index % CELLS];
             let point = DVec3::from_array(at.map(place));
-            *cell = (0..grown.len()).all(|i| pixel(targets, i, point).is_some_and(|p| grown[i][p]));
+            *cell = (0..grown.len()).all(|i| targets.place(i, point).is_some_and(|p| grown[i][p]));
             if *cell {
                 hull.points.push(point);
             }
         }
-        let pixels = |i| hull.points.iter().map(|&p| pixel(targets, i, p).expect("within the hull")).collect();
+        let pixels = |i| hull.points.iter().map(|&p| targets.place(i, p).expect("within the hull")).collect();
         hull.pixels = (0..targets.images.len()).map(pixels).collect();
         hull
     }
@@ -353,16 +353,6 @@ fn normals() -> Vec<DVec3> {
         }
     }
     all
-}
-
-/// The pixel of view `i` that shows `point`.
-fn pixel(targets: &Targets, i: usize, point: DVec3) -> Option<usize> {
-    let c = &targets.cameras[i];
-    let p = c.world_to_camera.transform_point3(point);
-    let (x, y) = (c.fx * p.x / p.z + c.cx, c.fy * p.y / p.z + c.cy);
-    let (width, height) = targets.size(i);
-    let inside = p.z > 0.0 && x >= 0.0 && y >= 0.0 && x < width as f64 && y < height as f64;
-    inside.then(|| y as usize * width + x as usize)
 }
 
 /// A mask and the pixels beside it.

@@ -84,12 +84,19 @@ impl Targets {
 
     /// The pixel of view `i` that shows `point`, straight RGBA; none outside the image or behind the camera.
     pub fn pixel(&self, i: usize, point: DVec3) -> Option<[u8; 4]> {
+        let (width, _) = self.size(i);
+        let place = self.place(i, point)?;
+        Some(self.images[i].get_pixel((place % width) as u32, (place / width) as u32).0)
+    }
+
+    /// Where that pixel is, row by row.
+    pub fn place(&self, i: usize, point: DVec3) -> Option<usize> {
         let c = &self.cameras[i];
         let p = c.world_to_camera.transform_point3(point);
         let (x, y) = (c.fx * p.x / p.z + c.cx, c.fy * p.y / p.z + c.cy);
         // Phrased so that NaN fails it.
         let (width, height) = self.size(i);
         let inside = p.z > 0.0 && x >= 0.0 && y >= 0.0 && x < width as f64 && y < height as f64;
-        inside.then(|| self.images[i].get_pixel(x as u32, y as u32).0)
+        inside.then(|| y as usize * width + x as usize)
     }
 }

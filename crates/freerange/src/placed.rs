@@ -24,7 +24,7 @@ pub(crate) struct Placed {
     /// These, in the canonical frame, and what is added to them.
     pub shown: Vec<View>,
     /// Whether they are where they are to stay.
-    settled: bool,
+    pub settled: bool,
 }
 
 impl Placed {
@@ -56,6 +56,9 @@ impl Placed {
         most: f32,
         tell: &mut impl FnMut(&Progress<'_>) -> Result<(), Error>,
     ) -> Result<(), Error> {
+        if self.shown.len() > MOST_MIRRORED {
+            return Ok(());
+        }
         let framing = if self.settled { 0 } else { config.iterations };
         let total = framing + mirror_steps(config);
         tell(&Progress::new(Stage::Mirror, 0, total))?;
@@ -71,10 +74,7 @@ impl Placed {
             let correction = frame_of(&moved, &self.shown)?;
             self.correct(&correction);
         }
-        let found = match self.shown.len() <= MOST_MIRRORED {
-            true => find_mirror(&self.shown, config, 0, |done| told(framing + done, &mut stopped))?,
-            false => None,
-        };
+        let found = find_mirror(&self.shown, config, 0, |done| told(framing + done, &mut stopped))?;
         stopped?;
         tell(&Progress::new(Stage::Mirror, total, total))?;
         if let Some(FoundMirror { mirror, contradiction }) = found.filter(|f| f.contradiction <= f64::from(most)) {

@@ -157,7 +157,7 @@ impl Reconstructor {
             let begin = Instant::now();
             fits = placed.quick_fits(fit, &options.seeds, members, &mut tell)?;
             seconds.push((Stage::Fit, begin.elapsed().as_secs_f64()));
-        } else if options.sample.polish > 0 && options.sample.mirror == 0.0 {
+        } else if options.sample.polish > 0 && !placed.settled {
             // What is polished begins elsewhere, but where the object is, a quick fit knows best there, too.
             let begin = Instant::now();
             placed.quick_fits(&QuickFitConfig::default(), &[0], 1, &mut tell)?;

@@ -328,7 +328,7 @@ fn photos_of_any_shape_and_size_are_seen_undistorted() {
     let squares = photos.each_ref().map(|v| Window::around(v).cut(v).into_owned());
     assert_eq!(squares.each_ref().map(|v| v.image.dimensions()), [(512, 512), (512, 512), (300, 300), (512, 512)]);
     let mut options = model.options().unwrap();
-    options.sample = SampleConfig { steps: 4, polish: 0, refine: 0, ..options.sample.without_start() };
+    options.sample = SampleConfig { steps: 4, mirror: 0.0, polish: 0, refine: 0, ..options.sample.without_start() };
     let run = |views: &[View], options: &Options| model.run(views, options, &mut go).unwrap().samples.remove(0);
     // What the network and its guidance see of a photo is what a square camera would have seen.
     assert_eq!(run(&photos, &options).gaussians, run(&squares, &options).gaussians);
