@@ -4,7 +4,7 @@
 #
 #     tools/python/run.sh target/release/freerange [FEATURES]
 #
-# FEATURES of the build: `as-tests` lets it use what the workspace's tests have built, with the same CARGO_OPTIONS. TORCH=no leaves out PyTorch (3 GB) and what needs it, RERUN=no Rerun.
+# FEATURES of the build: `as-tests` lets it use what the workspace's tests have built, with the same CARGO_OPTIONS. TORCH=no leaves out PyTorch (3 GB) and what needs it, RERUN=no Rerun, TIMES=no that time.
 set -euo pipefail
 FREERANGE=$(realpath "$1")
 export FREERANGE
@@ -45,4 +45,4 @@ else
   done
   echo "Rerun's file: $(stat -c %s "$folder/steps.rrd") bytes"
 fi
-"$folder/venv/bin/python" tools/python/times.py "$FREERANGE" examples/bowl
+[ "${TIMES:-yes}" = no ] || "$folder/venv/bin/python" tools/python/times.py "$FREERANGE" examples/bowl

@@ -103,6 +103,8 @@ fn reconstruct_writes_the_formats_asked_for() {
         "1",
         "--refine",
         "0",
+        "--mirror",
+        "0",
         "--format",
         "glb,spz,html,ply",
     ]);
