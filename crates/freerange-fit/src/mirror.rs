@@ -77,6 +77,8 @@ const APART: f64 = 0.2;
 /// Least cosine of the angle between a mirrored photo's direction and the nearest photo's, mean over the photos: where they share nothing,
 /// they cannot contradict each other.
 const BESIDE: f64 = 0.5;
+/// What of that cosine adds to a plane's contradiction where planes are compared: a mirrored photo that falls on a photo tells nothing new.
+const STALE: f64 = 0.4;
 /// Longest mean of the directions towards the cameras, as unit vectors: photos from one side do not tell how deep the object is, and so not
 /// where a plane lies.
 const ONE_SIDED: f64 = 0.75;
@@ -95,8 +97,9 @@ pub fn mirror_steps(config: &QuickFitConfig) -> usize {
     config.iterations + FITTED * (config.iterations + ROUNDS * going_on(config).iterations)
 }
 
-/// The plane about which an object is its own mirror image, as far as photos of it tell: none where no plane suits their outlines, or they are all
-/// from one side.
+/// The plane about which an object is its own mirror image, as far as photos of it tell: none where they contradict every plane by more than `most`
+/// (see [`FoundMirror::contradiction`]), no plane suits their outlines, or they are all from one side. Of several the one whose mirrored photos are
+/// contradicted little and far from the photos.
 /// `views` lie in the canonical frame.
 ///
 /// Three questions, each asked of fewer planes than the one before. Can what lies within all outlines and within all mirrored ones fill the outlines?
@@ -109,6 +112,7 @@ pub fn mirror_steps(config: &QuickFitConfig) -> usize {
 pub fn find_mirror(
     views: &[View],
     config: &QuickFitConfig,
+    most: f64,
     seed: u64,
     mut progress: impl FnMut(usize) -> ControlFlow<()>,
 ) -> Result<Option<FoundMirror>, FitError> {
@@ -122,7 +126,7 @@ pub fn find_mirror(
     let judged: Vec<Mirror> = best(judged, PLACED).into_iter().map(|(_, plane)| plane).collect();
     let Some(placed) = search.each(judged, |plane| place(&own, &pictures, plane, 0.04))? else { return Ok(None) };
     let before = difference(&own, &pictures, None)?;
-    let mut found: Option<FoundMirror> = None;
+    let mut found: Option<(f64, FoundMirror)> = None;
     for (_, mut plane) in best(placed, FITTED) {
         let both = |plane: &Mirror| [views, &mirrored(views, plane)[..]].concat();
         let Some(mut cloud) = search.fitted(None, &both(&plane), config)? else { return Ok(None) };
@@ -132,11 +136,12 @@ pub fn find_mirror(
             cloud = next;
         }
         let contradiction = difference(&cloud, &pictures, None)? / before.max(f64::MIN_POSITIVE);
-        if found.is_none_or(|found| contradiction < found.contradiction) {
-            found = Some(FoundMirror { mirror: plane, contradiction });
+        let value = contradiction + STALE * beside(&pictures, plane.normal);
+        if contradiction <= most && found.is_none_or(|(least, _)| value < least) {
+            found = Some((value, FoundMirror { mirror: plane, contradiction }));
         }
     }
-    Ok(found)
+    Ok(found.map(|(_, found)| found))
 }
 
 /// A search that tells how far it is. What it is asked for is none where it was ended.
@@ -432,14 +437,33 @@ mod tests {
     #[test]
     fn what_is_its_own_mirror_image_is_told_from_what_is_not() {
         let config = QuickFitConfig { iterations: 120, gaussians: 150, render_size: 64 };
-        let find =
-            |cloud: &Cloud| find_mirror(&photos(cloud), &config, 0, |_| ControlFlow::Continue(())).unwrap().unwrap();
+        let find = |cloud: &Cloud| {
+            find_mirror(&photos(cloud), &config, f64::INFINITY, 0, |_| ControlFlow::Continue(())).unwrap().unwrap()
+        };
         let found = find(&twins(20, 3, &MIRROR));
         let (normal, side) = (found.mirror.normal, found.mirror.normal.dot(MIRROR.normal).signum());
         assert!(normal.angle_between(side * MIRROR.normal) < 0.06, "{found:?}");
         assert!((side * found.mirror.offset - MIRROR.offset).abs() < 0.02, "{found:?}");
         let other = find(&round(40, 7));
         assert!(other.contradiction > 1.3 * found.contradiction, "{other:?} {found:?}");
+        let most = 0.99 * other.contradiction;
+        let none = find_mirror(&photos(&round(40, 7)), &config, most, 0, |_| ControlFlow::Continue(()));
+        assert!(none.unwrap().is_none_or(|found| found.contradiction <= most));
+    }
+
+    #[test]
+    fn a_mirrored_photo_is_new_where_it_falls_between_photos() {
+        let cloud = round(5, 3);
+        let at = |quarter: u32| {
+            let angle = f64::from(quarter) * PI / 2.0;
+            let eye = DVec3::new(1.5 * angle.cos(), 1.5 * angle.sin(), 0.0);
+            photograph(&cloud, &Camera::look_at(eye, DVec3::ZERO, DVec3::Z, 0.857, 16, 16))
+        };
+        let targets = Targets::new(&[0, 1, 2, 3].map(at), None).unwrap();
+        for (turn, cosine) in [(0.0f64, 1.0), (PI / 8.0, 0.5f64.sqrt()), (PI / 4.0, 1.0)] {
+            let found = beside(&targets, DVec3::new(turn.cos(), turn.sin(), 0.0));
+            assert!((found - cosine).abs() < 1e-9, "{turn}: {found}");
+        }
     }
 
     #[test]
@@ -447,7 +471,7 @@ mod tests {
         let config = QuickFitConfig { iterations: 7, gaussians: 30, render_size: 32 };
         let views = photos(&twins(10, 3, &MIRROR));
         let mut told = Vec::new();
-        find_mirror(&views, &config, 0, |done| {
+        find_mirror(&views, &config, f64::INFINITY, 0, |done| {
             told.push(done);
             ControlFlow::Continue(())
         })
@@ -458,12 +482,12 @@ mod tests {
         assert!(told.iter().copied().eq(1..=told.len()) && told.len() <= mirror_steps(&config), "{told:?}");
         for last in [1, 9, 16] {
             let mut reached = 0;
-            let found = find_mirror(&views, &config, 0, |done| {
+            let found = find_mirror(&views, &config, f64::INFINITY, 0, |done| {
                 reached = done;
                 if done == last { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
             });
             assert!(found.unwrap().is_none() && reached == last, "{last}: {reached}");
         }
-        assert!(find_mirror(&[], &config, 0, |_| ControlFlow::Continue(())).is_err());
+        assert!(find_mirror(&[], &config, f64::INFINITY, 0, |_| ControlFlow::Continue(())).is_err());
     }
 }

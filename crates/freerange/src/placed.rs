@@ -74,10 +74,10 @@ impl Placed {
             let correction = frame_of(&moved, &self.shown)?;
             self.correct(&correction);
         }
-        let found = find_mirror(&self.shown, config, 0, |done| told(framing + done, &mut stopped))?;
+        let found = find_mirror(&self.shown, config, most.into(), 0, |done| told(framing + done, &mut stopped))?;
         stopped?;
         tell(&Progress::new(Stage::Mirror, total, total))?;
-        if let Some(FoundMirror { mirror, contradiction }) = found.filter(|f| f.contradiction <= f64::from(most)) {
+        if let Some(FoundMirror { mirror, contradiction }) = found {
             let [x, y, z] = mirror.normal.to_array();
             self.frame.notes.push(format!(
                 "the object is taken to be its own mirror image about the plane with normal ({x:.2}, {y:.2}, {z:.2}): mirrored photos are \
