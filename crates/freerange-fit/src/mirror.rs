@@ -57,9 +57,10 @@ impl Mirror {
 pub struct FoundMirror {
     /// The plane.
     pub mirror: Mirror,
-    /// How unlike the photos a fit of them together with the mirrored ones is, as a part of how unlike a fit of them alone is. It has
-    /// had twice the steps: below 1 where mirrored photos agree with the photos, twice that and more where they do not.
-    pub contradiction: f64,
+    /// How unlike the photos a fit of them together with the mirrored ones is, as a part of how unlike a fit of them alone is (it has
+    /// had twice the steps: below 1 where mirrored photos agree with the photos, twice that and more where they do not); less 0.4 times
+    /// how far mirrored photos are from the photos, as 1 less the cosine between directions, since what is new may contradict a little.
+    pub doubt: f64,
 }
 
 /// Longest side, in pixels, of the outlines that planes are judged by.
@@ -77,8 +78,8 @@ const APART: f64 = 0.2;
 /// Least cosine of the angle between a mirrored photo's direction and the nearest photo's, mean over the photos: where they share nothing,
 /// they cannot contradict each other.
 const BESIDE: f64 = 0.5;
-/// What of that cosine adds to a plane's contradiction where planes are compared: a mirrored photo that falls on a photo tells nothing new.
-const STALE: f64 = 0.4;
+/// How much a plane may be contradicted more whose mirrored photos are far from the photos: one that falls on a photo tells nothing new.
+const NEW: f64 = 0.4;
 /// Longest mean of the directions towards the cameras, as unit vectors: photos from one side do not tell how deep the object is, and so not
 /// where a plane lies.
 const ONE_SIDED: f64 = 0.75;
@@ -97,9 +98,8 @@ pub fn mirror_steps(config: &QuickFitConfig) -> usize {
     config.iterations + FITTED * (config.iterations + ROUNDS * going_on(config).iterations)
 }
 
-/// The plane about which an object is its own mirror image, as far as photos of it tell: none where they contradict every plane by more than `most`
-/// (see [`FoundMirror::contradiction`]), no plane suits their outlines, or they are all from one side. Of several the one whose mirrored photos are
-/// contradicted little and far from the photos.
+/// The plane about which an object is its own mirror image, as far as photos of it tell: none where they doubt every plane by more than `most`
+/// (see [`FoundMirror::doubt`]), no plane suits their outlines, or they are all from one side. Of several the one that they doubt least.
 /// `views` lie in the canonical frame.
 ///
 /// Three questions, each asked of fewer planes than the one before. Can what lies within all outlines and within all mirrored ones fill the outlines?
@@ -126,7 +126,7 @@ pub fn find_mirror(
     let judged: Vec<Mirror> = best(judged, PLACED).into_iter().map(|(_, plane)| plane).collect();
     let Some(placed) = search.each(judged, |plane| place(&own, &pictures, plane, 0.04))? else { return Ok(None) };
     let before = difference(&own, &pictures, None)?;
-    let mut found: Option<(f64, FoundMirror)> = None;
+    let mut found: Option<FoundMirror> = None;
     for (_, mut plane) in best(placed, FITTED) {
         let both = |plane: &Mirror| [views, &mirrored(views, plane)[..]].concat();
         let Some(mut cloud) = search.fitted(None, &both(&plane), config)? else { return Ok(None) };
@@ -136,12 +136,12 @@ pub fn find_mirror(
             cloud = next;
         }
         let contradiction = difference(&cloud, &pictures, None)? / before.max(f64::MIN_POSITIVE);
-        let value = contradiction + STALE * beside(&pictures, plane.normal);
-        if contradiction <= most && found.is_none_or(|(least, _)| value < least) {
-            found = Some((value, FoundMirror { mirror: plane, contradiction }));
+        let doubt = contradiction - NEW * (1.0 - beside(&pictures, plane.normal));
+        if doubt <= found.map_or(most, |found| found.doubt) {
+            found = Some(FoundMirror { mirror: plane, doubt });
         }
     }
-    Ok(found.map(|(_, found)| found))
+    Ok(found)
 }
 
 /// A search that tells how far it is. What it is asked for is none where it was ended.
@@ -445,10 +445,10 @@ mod tests {
         assert!(normal.angle_between(side * MIRROR.normal) < 0.06, "{found:?}");
         assert!((side * found.mirror.offset - MIRROR.offset).abs() < 0.02, "{found:?}");
         let other = find(&round(40, 7));
-        assert!(other.contradiction > 1.3 * found.contradiction, "{other:?} {found:?}");
-        let most = 0.99 * other.contradiction;
+        assert!(other.doubt > found.doubt + 0.3, "{other:?} {found:?}");
+        let most = other.doubt - 0.01;
         let none = find_mirror(&photos(&round(40, 7)), &config, most, 0, |_| ControlFlow::Continue(()));
-        assert!(none.unwrap().is_none_or(|found| found.contradiction <= most));
+        assert!(none.unwrap().is_none_or(|found| found.doubt <= most));
     }
 
     #[test]

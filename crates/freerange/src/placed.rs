@@ -49,7 +49,7 @@ impl Placed {
         Ok(Self { frame, canonical, chosen, shown, settled })
     }
 
-    /// Adds mirrored photos as further views where the object is its own mirror image: where they contradict the photos by `most` or less.
+    /// Adds mirrored photos as further views where the object is its own mirror image: where these doubt it by `most` or less.
     pub fn mirror(
         &mut self,
         config: &QuickFitConfig,
@@ -77,11 +77,11 @@ impl Placed {
         let found = find_mirror(&self.shown, config, most.into(), 0, |done| told(framing + done, &mut stopped))?;
         stopped?;
         tell(&Progress::new(Stage::Mirror, total, total))?;
-        if let Some(FoundMirror { mirror, contradiction }) = found {
+        if let Some(FoundMirror { mirror, doubt }) = found {
             let [x, y, z] = mirror.normal.to_array();
             self.frame.notes.push(format!(
                 "the object is taken to be its own mirror image about the plane with normal ({x:.2}, {y:.2}, {z:.2}): mirrored photos are \
-                 further views (contradiction {contradiction:.2}, at most {most})"
+                 further views (doubt {doubt:.2}, at most {most})"
             ));
             self.shown.extend(mirrored(&self.shown, &mirror));
             self.canonical.extend(mirrored(&self.canonical, &mirror));

@@ -105,8 +105,8 @@ pub struct Sampling {
     /// [default: the checkpoint's].
     #[arg(long, value_name = "STEPS")]
     pub regroup: Option<usize>,
-    /// Take photos mirrored about the object's plane of symmetry as further input views where, by a fit of both, they contradict the
-    /// photos by at most so much; 0 is never [default: the checkpoint's].
+    /// Take photos mirrored about the object's plane of symmetry as further input views where, by a fit of both, the photos doubt
+    /// it by at most so much; 0 is never [default: the checkpoint's].
     #[arg(long, value_name = "MOST")]
     pub mirror: Option<f32>,
     /// Seed of the (first) sample.

@@ -50,8 +50,8 @@ pub struct SampleConfig {
     pub coupling: Coupling,
     /// Arithmetic of the transformer's blocks.
     pub compute: Compute,
-    /// Most that photos mirrored about the object's plane of symmetry may [contradict](freerange_fit::FoundMirror::contradiction) the
-    /// photos to be further input views of everything that follows. 0: none are looked for.
+    /// Most that photos may [doubt](freerange_fit::FoundMirror::doubt) the object's plane of symmetry for photos mirrored about it
+    /// to be further input views of everything that follows. 0: none are looked for.
     /// [`reconstruct`](super::reconstruct) itself takes what it is given.
     #[serde(skip_serializing_if = "is_nothing")]
     pub mirror: f32,
