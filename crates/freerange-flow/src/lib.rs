@@ -12,6 +12,7 @@ pub mod log;
 mod optimizer;
 pub mod path;
 pub mod photometric;
+mod place;
 pub mod ranks;
 pub mod sample;
 pub mod symmetry;

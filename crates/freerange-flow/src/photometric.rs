@@ -2,10 +2,11 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use freerange_camera::{Camera, View, image_ops::to_f32_rgba};
+use freerange_model::OBSERVATION;
 use freerange_raster::{RasterConfig, rasterize};
 use freerange_splat::{Normalization, channel};
 
-use crate::FlowError;
+use crate::{FlowError, place::place};
 
 /// The posed images of every object of a batch on the device, before any background: the same number of views, of one
 /// size, for every object.
@@ -116,7 +117,8 @@ impl Photometric {
         leaf.grad_remove(&mut gradients).ok_or(FlowError::NoGradient)
     }
 
-    /// What the views show of each Gaussian of `normalized` (`[b, n, 14]`): `[b, n, 9]`, about one unit large.
+    /// What the views show of each Gaussian of `normalized` (`[b, n, 14]`): `[b, n, channels]`, about one unit large; 9 channels, or 32 with
+    /// where it lies.
     ///
     /// A Gaussian weighs in a pixel what blending gives it there. Summed over a view, these weights `w` say how much of it is
     /// seen, and the colours they lie on what it should look like. The channels are
@@ -126,15 +128,25 @@ impl Photometric {
     /// - 3 to 5: the object's colour there, averaged over views, less the Gaussian's own, in normalised units;
     /// - 6 to 8: its standard deviation between views, in normalised units: large where views do not see the same surface.
     ///
-    /// Where nothing is seen, all are 0.
-    pub fn observe(&self, normalized: Tensor<3>, targets: &Targets) -> Result<Tensor<3>, FlowError> {
+    /// Where nothing is seen, these are 0.
+    ///
+    /// Where its centre lies, by the pixel of each view that shows it (`model.place_channels`):
+    /// - 9, 10: distance to the outline, positive within: least of all views, and mean, in tenths of a unit;
+    /// - 11, 12: how far behind the rendered surface: least of all views, and mean, in tenths of a unit;
+    /// - 13 to 15: the photos' colours there, averaged over views that show the object, less the Gaussian's own, in normalised units;
+    /// - 16 to 18: their standard deviation between views, in normalised units;
+    /// - 19 to 21: the way to the outlines of the views in which it lies beside them, mean over all views, in twentieths of a unit;
+    /// - 22 to 28: of the view that sees it best, how unlike the colours are in which the others see points on its ray, 0.04, 0.02 and 0.01
+    ///   before and 0.01, 0.02 and 0.04 behind the centre, five times as much as at the centre less; and twice that at the centre;
+    /// - 29 to 31: the direction of that ray. Where no view sees it, all from 22 on are 0.
+    pub fn observe(&self, normalized: Tensor<3>, targets: &Targets, channels: usize) -> Result<Tensor<3>, FlowError> {
         let [b, n, c] = normalized.dims();
         let [_, v, h, w, _] = targets.object.dims();
         let gaussians = self.denormalize(normalized.inner());
         let own = gaussians.clone().narrow(2, channel::COLOR.start, 3);
         // Every view is an object of its own, so that sums are over its pixels alone. What blending is linear in, the colours,
         // has as its gradient the sums of weights times whatever the images of a linear loss hold.
-        let each = gaussians.unsqueeze_dim::<4>(1).repeat_dim(1, v).reshape([b * v, n, c]);
+        let each = gaussians.clone().unsqueeze_dim::<4>(1).repeat_dim(1, v).reshape([b * v, n, c]);
         let cameras: Vec<_> = targets.cameras.iter().flatten().map(|&camera| vec![camera]).collect();
         let raster = RasterConfig::default().shrunk(w.max(h) as f32 / VIEWER_SIZE);
         let weigh = |pixels: Tensor<5>| {
@@ -159,16 +171,18 @@ impl Photometric {
         let apart = (of_view - mean.clone().unsqueeze_dim::<4>(1)).square() * covered;
         let deviation = (over_views(apart) / divisor).sqrt();
         let unit = self.std.clone().narrow(2, channel::COLOR.start, 3);
-        Ok(Tensor::cat(
-            vec![
-                (total.clone() + 1.0).log().mul_scalar(0.5),
-                over_views(seen.clone() / (seen + 1.0)).mul_scalar(0.5),
-                (total.clone() - inside) / total.clamp_min(LEAST_SEEN),
-                (mean - own) / unit.clone() * any.clone(),
-                deviation / unit * any,
-            ],
-            2,
-        ))
+        let mut all = vec![
+            (total.clone() + 1.0).log().mul_scalar(0.5),
+            over_views(seen.clone() / (seen + 1.0)).mul_scalar(0.5),
+            (total.clone() - inside) / total.clamp_min(LEAST_SEEN),
+            (mean - own) / unit.clone() * any.clone(),
+            deviation / unit.clone() * any,
+        ];
+        if channels > OBSERVATION {
+            let unit = unit.into_data().convert::<f32>().try_to_vec::<f32>().expect("floats");
+            all.push(place(gaussians, unit.try_into().expect("three"), targets, &raster)?);
+        }
+        Ok(Tensor::cat(all, 2))
     }
 }
 
@@ -234,7 +248,12 @@ mod tests {
         let normalized: Vec<f32> =
             rows.iter().flat_map(|r| (0..14).map(|i| (r[i] - normalization.mean[i]) / normalization.std[i])).collect();
         let tensor = Tensor::<3>::from_data(TensorData::new(normalized, [1, n, 14]), &Device::flex());
-        let found = photometric.observe(tensor, &targets).unwrap().into_data().try_to_vec::<f32>().unwrap();
+        let found = photometric
+            .observe(tensor.clone(), &targets, OBSERVATION)
+            .unwrap()
+            .into_data()
+            .try_to_vec::<f32>()
+            .unwrap();
 
         let raster = RasterConfig::default().shrunk(size as f32 / VIEWER_SIZE);
         for (i, row) in rows.iter().enumerate() {

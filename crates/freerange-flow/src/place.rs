@@ -1,6 +1,6 @@
 //! Where each Gaussian lies with respect to what views show: their outlines, the surface that is rendered, colours that agree.
 //!
-//! Computed on the host, from pictures that are small: a training step of four objects spends a hundredth of its time here.
+//! Computed on the host, on all its threads, from pictures that are small: on a GPU every estimate waits for it.
 
 use burn::tensor::{Tensor, TensorData};
 use freerange_camera::Camera;

@@ -62,8 +62,8 @@ pub fn step(
         });
         let gradient = gradient.map(|g| scale_gradient(g, gradient_rms) * batch.conditional.clone());
         let observation = match &earlier {
-            Some(earlier) if model.dit().observation_channels() => {
-                Some(photometric.observe(earlier.clone(), &batch.gradient_targets)?)
+            Some(earlier) if model.dit().observed() > 0 => {
+                Some(photometric.observe(earlier.clone(), &batch.gradient_targets, model.dit().observed())?)
             }
             _ => None,
         };

@@ -347,7 +347,7 @@ fn a_fit_is_mended() {
         .replace("views = 8", "views = 16\ninput_fits = 1\nquick_fit = { iterations = 60, gaussians = 64, render_size = 32 }")
         .replace(
             "[model]",
-            "[model]\nestimate_channels = true\nobservation_channels = true\npreconditioning = [0.1, 0.1, 0.1, 0.5, 0.5, 0.5, \
+            "[model]\nestimate_channels = true\nobservation_channels = true\nplace_channels = true\npreconditioning = [0.1, 0.1, 0.1, 0.5, 0.5, 0.5, \
              0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5]",
         )
         .replace(

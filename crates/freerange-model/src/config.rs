@@ -10,6 +10,8 @@ pub const CHANNELS: usize = freerange_splat::channel::COUNT;
 pub const PLUCKER: usize = 6;
 /// Channels per Gaussian of what the input views show of it.
 pub const OBSERVATION: usize = 9;
+/// Channels per Gaussian of where it lies with respect to what the input views show.
+pub const PLACE: usize = 23;
 
 /// Sizes of the whole network. The defaults are the paper's.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -46,6 +48,10 @@ pub struct ModelConfig {
     /// Whether what the input views show of that estimate is one, too: how much of each Gaussian they see, and in which colours
     /// (not the paper's). Without an estimate, zeros stand for it.
     pub observation_channels: bool,
+    /// Whether it is also told where each Gaussian of that estimate lies with respect to what the input views show: their outlines, the
+    /// surface, colours that agree (not the paper's). Needs `observation_channels`.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub place_channels: bool,
     /// With these, the last layer tells but the correction, of unit variance at all times, to what the noisy Gaussians and
     /// the earlier estimate say together (preconditioning: Karras et al. 2022; not the paper's): standard deviations, one
     /// per channel, of what such estimates are off by, in normalised units. Without an estimate they are 1.
@@ -138,6 +144,7 @@ impl Default for ModelConfig {
             gradient_channels: true,
             estimate_channels: false,
             observation_channels: false,
+            place_channels: false,
             preconditioning: None,
         }
     }
@@ -275,7 +282,16 @@ impl ModelConfig {
     /// Width of a Gaussian token before the input projection.
     pub fn gaussian_channels(&self) -> usize {
         let kinds = 1 + usize::from(self.gradient_channels) + usize::from(self.estimate_channels);
-        self.gaussians_per_token * (CHANNELS * kinds + if self.observation_channels { OBSERVATION } else { 0 })
+        self.gaussians_per_token * (CHANNELS * kinds + self.observed())
+    }
+
+    /// Channels per Gaussian of what the input views show of it.
+    pub fn observed(&self) -> usize {
+        match (self.observation_channels, self.place_channels) {
+            (false, _) => 0,
+            (true, false) => OBSERVATION,
+            (true, true) => OBSERVATION + PLACE,
+        }
     }
 
     /// Tokens in the transformer for `views` images and `gaussians` Gaussians.
@@ -311,6 +327,13 @@ impl ModelConfig {
         if self.observation_channels && !self.estimate_channels {
             let expected = "false without estimate_channels";
             return Err(ModelError::config("observation_channels", expected, self.observation_channels));
+        }
+        if self.place_channels && !self.observation_channels {
+            return Err(ModelError::config(
+                "place_channels",
+                "false without observation_channels",
+                self.place_channels,
+            ));
         }
         match &self.encoder {
             EncoderConfig::Patch(c) => {

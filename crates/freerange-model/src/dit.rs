@@ -10,7 +10,7 @@ use burn::{
 
 use crate::{
     ModelConfig, ModelError,
-    config::{CHANNELS, FinalLayer, OBSERVATION},
+    config::{CHANNELS, FinalLayer, PLACE},
     kernels::block::BlockSettings,
     layers::{Builder, Init, Linear, NormWeight, Source},
     ops::{self, Compute},
@@ -28,7 +28,7 @@ pub struct Dit {
     gaussians_per_token: usize,
     gradient_channels: bool,
     estimate_channels: bool,
-    observation_channels: bool,
+    observed: usize,
     time_features: usize,
     #[module(skip)]
     preconditioning: Option<[f32; CHANNELS]>,
@@ -262,7 +262,7 @@ impl Dit {
             gaussians_per_token: config.gaussians_per_token,
             gradient_channels: config.gradient_channels,
             estimate_channels: config.estimate_channels,
-            observation_channels: config.observation_channels,
+            observed: config.observed(),
             preconditioning: config.preconditioning,
             time_features: config.time_features,
             compute: Compute::F32,
@@ -304,9 +304,22 @@ impl Dit {
         self.estimate_channels
     }
 
-    /// Whether [`forward`](Self::forward) takes what the input views show of that estimate.
-    pub fn observation_channels(&self) -> bool {
-        self.observation_channels
+    /// Channels of what the input views show of that estimate that [`forward`](Self::forward) takes; 0: none.
+    pub fn observed(&self) -> usize {
+        self.observed
+    }
+
+    /// The same network with [`PLACE`] more channels of this kind, of which it knows nothing yet.
+    pub(crate) fn with_place_channels(mut self) -> Self {
+        let p = self.gaussians_per_token;
+        self.gs_in.weight = self.gs_in.weight.map(|weight| {
+            let [d, columns] = weight.dims();
+            let weight = weight.reshape([d, p, columns / p]); // those of what views show are last
+            let none = Tensor::zeros([d, p, PLACE], &weight.device());
+            Tensor::cat(vec![weight, none], 2).reshape([d, columns + p * PLACE])
+        });
+        self.observed += PLACE;
+        self
     }
 
     /// The conditioning vector of the time: `t` `[b]` in 0..1 to `[b, d]`.
@@ -323,7 +336,7 @@ impl Dit {
         let kinds = [
             ("gradient", self.gradient_channels, feedback.gradient, CHANNELS),
             ("estimate", self.estimate_channels, feedback.estimate, CHANNELS),
-            ("observation", self.observation_channels, feedback.observation, OBSERVATION),
+            ("observation", self.observed > 0, feedback.observation, self.observed),
         ];
         let mut gaussians = vec![noisy.clone()];
         for (name, wanted, given, width) in kinds {

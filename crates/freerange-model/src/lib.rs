@@ -20,7 +20,9 @@ mod tests;
 mod weights;
 
 pub use checkpoint::{Checkpoint, Header, Precision};
-pub use config::{CHANNELS, Dinov2Config, EncoderConfig, FinalLayer, ModelConfig, OBSERVATION, PLUCKER, PatchConfig};
+pub use config::{
+    CHANNELS, Dinov2Config, EncoderConfig, FinalLayer, ModelConfig, OBSERVATION, PLACE, PLUCKER, PatchConfig,
+};
 pub use dit::{Dit, Feedback, time_embedding};
 pub use encoder::{Dinov2, ImageEncoder, WeightsOrigin, position_embedding};
 pub use error::ModelError;

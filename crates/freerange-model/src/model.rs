@@ -97,6 +97,12 @@ impl FreeRange {
         self
     }
 
+    /// The same model with [place channels](ModelConfig::place_channels), of which it knows nothing yet: it says the same whatever they tell.
+    pub fn with_place_channels(mut self) -> Self {
+        self.dit = self.dit.with_place_channels();
+        self
+    }
+
     /// The image encoder.
     pub fn encoder(&self) -> &ImageEncoder {
         &self.encoder

@@ -162,8 +162,8 @@ impl<'a> Sampler<'a> {
             }
         };
         let observation = match &known {
-            Some(known) if self.network.observation_channels => {
-                Some(self.photometric.observe(known.clone(), &targets())?)
+            Some(known) if self.network.observed() > 0 => {
+                Some(self.photometric.observe(known.clone(), &targets(), self.network.observed())?)
             }
             _ => None,
         };

@@ -9,7 +9,9 @@ use crate::FlowError;
 
 /// Weights fit only the architecture they were trained in; the image size may differ.
 pub(super) fn require_same_model(model: &ModelConfig, given: &ModelConfig) -> Result<(), FlowError> {
-    let given = ModelConfig { image_size: model.image_size, ..given.architecture() };
+    let mut given = ModelConfig { image_size: model.image_size, ..given.architecture() };
+    // What it was not told yet it can be.
+    given.place_channels |= model.place_channels && given.observation_channels;
     let model = model.architecture();
     if given == model {
         return Ok(());

@@ -129,7 +129,11 @@ impl State {
         encoder: Option<WeightsOrigin>,
     ) -> Self {
         if let Some(Initial { checkpoint, .. }) = initial {
-            model = Weights::of(&checkpoint.model.clone().take_dinov2().0).apply(model);
+            let mut known = checkpoint.model.clone().take_dinov2().0;
+            if model.dit().observed() > known.dit().observed() {
+                known = known.with_place_channels();
+            }
+            model = Weights::of(&known).apply(model);
         }
         // The gradient by normalised Gaussians grows with what they were divided by.
         let square = |i: usize, old: &Checkpoint| {

@@ -207,6 +207,32 @@ fn a_run_keeps_what_its_initial_checkpoint_knows_of_gradients() {
 }
 
 #[test]
+fn a_run_may_be_told_where_gaussians_lie_that_its_initial_checkpoint_was_not() {
+    let [first, second, third] = [(); 3].map(|()| tempfile::tempdir().unwrap());
+    let mut narrow = config();
+    narrow.model.estimate_channels = true;
+    narrow.model.observation_channels = true;
+    let mut wide = narrow.clone();
+    wide.model.place_channels = true;
+    let begun = |config: &TrainConfig, folder: &Path, from: Option<&Path>| {
+        let path = from.map(|from| from.join("checkpoint.safetensors"));
+        let checkpoint = path.map(|path| Checkpoint::load(&path, &Device::flex()).unwrap());
+        let initial = checkpoint.as_ref().map(|checkpoint| Initial { checkpoint, remeasure: false });
+        let trainer = Trainer::open(config.clone(), folder, initial, &Device::flex(), |_| {})?;
+        trainer.save()?;
+        Ok::<_, FlowError>(numbers(&Weights::of(&trainer.model)))
+    };
+    let before = begun(&narrow, first.path(), None).unwrap();
+    let after = begun(&wide, second.path(), Some(first.path())).unwrap();
+    let more = narrow.model.hidden * narrow.model.gaussians_per_token * freerange_model::PLACE;
+    assert_eq!(after.len(), before.len() + more);
+    let told = |values: &[f32]| values.iter().copied().filter(|&x| x != 0.0).collect::<Vec<f32>>();
+    assert_eq!(told(&after), told(&before), "what it does not know of weighs nothing");
+    let refused = begun(&narrow, third.path(), Some(second.path())).unwrap_err().to_string();
+    assert!(refused.contains("architecture of the initial checkpoint"), "{refused}");
+}
+
+#[test]
 fn training_in_f16_is_refused() {
     let mut config = config();
     config.optimizer.compute = Compute::F16;

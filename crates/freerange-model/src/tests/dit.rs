@@ -1,11 +1,11 @@
 use burn::{
     module::{Module, ModuleVisitor, Param},
-    tensor::{Device, Gradients, Tensor},
+    tensor::{Device, Gradients, Tensor, TensorData},
 };
 
 use super::{Golden, devices, half_devices, numbers, path};
 use crate::{
-    Compute, Dit, EncoderConfig, Feedback, FinalLayer, FreeRange, ModelConfig, PatchConfig,
+    Compute, Dit, EncoderConfig, Feedback, FinalLayer, FreeRange, ModelConfig, OBSERVATION, PLACE, PatchConfig,
     dit::{Parts, time_embedding},
     layers::Builder,
     weights::TensorFile,
@@ -259,6 +259,35 @@ fn what_is_known_is_corrected() {
     // Without an estimate, as much is left to tell as normalised Gaussians vary.
     assert!((0..8 * 14).any(|i| ((with[i] - 0.7) / 0.5 - without[i]).abs() > 1e-3), "the network sees it");
     assert_eq!(with[2 * 8 * 14..], without[2 * 8 * 14..], "at the end nothing is left to correct");
+}
+
+#[test]
+fn what_a_model_was_not_told_yet_changes_nothing() {
+    let device = Device::flex();
+    let narrow = ModelConfig { estimate_channels: true, observation_channels: true, ..small(2, true) };
+    let wide = ModelConfig { place_channels: true, ..narrow.clone() };
+    wide.validate().unwrap();
+    assert_eq!([narrow.observed(), wide.observed()], [OBSERVATION, OBSERVATION + PLACE]);
+    let refused = ModelConfig { observation_channels: false, ..wide.clone() }.validate().unwrap_err();
+    assert!(refused.to_string().contains("place_channels"), "{refused}");
+    let mut rng = <rand_chacha::ChaCha8Rng as rand::SeedableRng>::seed_from_u64(5);
+    let model = FreeRange::new(&narrow, &mut rng, &device).unwrap();
+    let mut drawn = |n: usize| (0..n).map(|_| rand::Rng::random_range(&mut rng, -0.3..0.3)).collect::<Vec<f32>>();
+    let values: Vec<Vec<f32>> = model.parameters().into_iter().map(|p| drawn(p.values.len())).collect();
+    let model = model.set_parameters(&values).unwrap();
+    let mut random = |c: usize| Tensor::<3>::from_data(TensorData::new(drawn(2 * 8 * c), [2, 8, c]), &device);
+    let (z, seen, place) = (random(14), random(OBSERVATION), random(PLACE));
+    let images = Tensor::<3>::ones([2, 4, narrow.image_token_width()], &device);
+    let run = |model: &FreeRange, observation: Tensor<3>| {
+        let feedback = Feedback { gradient: None, estimate: Some(z.clone()), observation: Some(observation) };
+        numbers(model.denoise(z.clone(), feedback, images.clone(), Tensor::from_floats([0.0, 0.4], &device)))
+    };
+    let before = run(&model, seen.clone());
+    let both = Tensor::cat(vec![seen, place], 2);
+    let model = model.with_place_channels();
+    super::assert_close("with place channels", &run(&model, both.clone()), &before, 1e-5);
+    let shapes = |model: &FreeRange| model.parameters().into_iter().map(|p| (p.name, p.shape)).collect::<Vec<_>>();
+    assert_eq!(shapes(&model), shapes(&FreeRange::new(&wide, &mut rng, &device).unwrap()));
 }
 
 #[test]
