@@ -28,7 +28,7 @@ pub(crate) fn place(
     raster: &RasterConfig,
 ) -> Result<Tensor<3>, FlowError> {
     let device = gaussians.device();
-    let [b, n, c] = gaussians.dims();
+    let [b, n, _] = gaussians.dims();
     let [_, v, h, w, _] = targets.object.dims();
     let rows = floats(gaussians);
     let rows = rows.as_chunks::<{ channel::COUNT }>().0;
@@ -49,7 +49,6 @@ pub(crate) fn place(
         })
         .collect();
     let places = rows.par_iter().enumerate().flat_map_iter(|(i, row)| place_of(row, unit, &views[i / n * v..][..v]));
-    debug_assert_eq!(c, channel::COUNT);
     Ok(Tensor::from_data(TensorData::new(places.collect::<Vec<f32>>(), [b, n, PLACE]), &device))
 }
 
