@@ -122,6 +122,7 @@ pub struct Sampling {
     mend: Option<usize>,
     regroup: Option<usize>,
     mirror: Option<f32>,
+    turn: Option<f32>,
     start: Option<String>,
     depth: Option<u32>,
     cfg_scale: Option<f32>,
@@ -153,6 +154,7 @@ impl Sampling {
         sample.mend = self.mend.unwrap_or(sample.mend);
         sample.regroup = self.regroup.unwrap_or(sample.regroup);
         sample.mirror = self.mirror.unwrap_or(sample.mirror);
+        sample.turn = self.turn.unwrap_or(sample.turn);
         sample.ensemble = self.ensemble.unwrap_or(sample.ensemble);
         if let Some(name) = self.solver {
             let solver: Option<Solver> = serde_json::from_value(name.as_str().into()).ok();

@@ -78,7 +78,7 @@ def last_sample(steps):
 def test_masks_alpha_and_floats_tell_the_same(model, bowl):
     images, intrinsics, c2w = bowl
     images = np.where(images[..., 3:] == 0, np.uint8(0), images)
-    quick = dict(convention="opengl", refine=0, steps=1, ensemble=1, mirror=0)
+    quick = dict(convention="opengl", refine=0, steps=1, ensemble=1, mirror=0, turn=0)
     with_alpha = model.reconstruct(images, intrinsics, c2w, **quick)
     for rgb, masks in [
         (images[..., :3], images[..., 3]),
@@ -97,7 +97,7 @@ def test_masks_alpha_and_floats_tell_the_same(model, bowl):
 def test_seeds_are_samples(model, bowl):
     images, intrinsics, c2w = bowl
     # Not polished: relocation draws by opacity, and makes of any difference in rounding another sample.
-    quick = dict(convention="opengl", refine=0, steps=2, start="noise", polish=0, mirror=0, compute="f32")
+    quick = dict(convention="opengl", refine=0, steps=2, start="noise", polish=0, mirror=0, turn=0, compute="f32")
     two = model.reconstruct(images, intrinsics, c2w, seed=[5, 6], **quick)
     assert [g.seed for g in two] == [5, 6]
     assert not np.array_equal(two[0].means, two[1].means)
@@ -128,7 +128,7 @@ def test_an_exception_in_on_step_ends_the_work(model):
             raise Enough
 
     with pytest.raises(Enough):
-        model.reconstruct_scene(BOWL, mirror=0, on_step=stop)
+        model.reconstruct_scene(BOWL, mirror=0, turn=0, on_step=stop)
     assert seen[-1].done == 3
 
 

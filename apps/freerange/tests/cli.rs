@@ -52,7 +52,7 @@ fn refused(scene: &Path, extra: &[&str], words: &[&str]) {
     let output = place.path().join("result");
     let mut args =
         vec!["reconstruct", scene.to_str().unwrap(), "-o", output.to_str().unwrap(), "--steps", "1", "--refine", "0"];
-    args.extend(["--mirror", "0"]);
+    args.extend(["--mirror", "0", "--turn", "0"]);
     args.extend(extra);
     let done = freerange(&args);
     let message = String::from_utf8_lossy(&done.stderr).into_owned();
@@ -130,6 +130,8 @@ fn the_same_seed_gives_the_same_bytes() {
             "--refine",
             "3",
             "--mirror",
+            "0",
+            "--turn",
             "0",
             "--seed",
             seed,
@@ -273,6 +275,8 @@ fn a_full_disk() {
             "--refine".as_ref(),
             "0".as_ref(),
             "--mirror".as_ref(),
+            "0".as_ref(),
+            "--turn".as_ref(),
             "0".as_ref(),
         ])
         .output()

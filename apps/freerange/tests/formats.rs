@@ -105,6 +105,8 @@ fn reconstruct_writes_the_formats_asked_for() {
         "0",
         "--mirror",
         "0",
+        "--turn",
+        "0",
         "--format",
         "glb,spz,html,ply",
     ]);

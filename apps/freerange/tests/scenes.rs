@@ -32,7 +32,7 @@ fn copy(from: &Path, to: &Path) {
 /// Makes the scenes of a list as quickly as can be; the exit code, the table, and what was said.
 fn made(list: &Path, out: &Path, more: &[&str]) -> (i32, Vec<Value>, String) {
     let mut args = vec!["reconstruct", "--list", list.to_str().unwrap(), "-o", out.to_str().unwrap(), "--json"];
-    args.extend(["--steps", "1", "--refine", "0", "--mirror", "0"]);
+    args.extend(["--steps", "1", "--refine", "0", "--mirror", "0", "--turn", "0"]);
     args.extend(more);
     let done = freerange(&args);
     let said = String::from_utf8_lossy(&done.stderr).into_owned();
@@ -134,7 +134,7 @@ fn photos_held_out_are_compared_with_and_not_used() {
     let out = place.path().join("out");
     let args = |holdout: &'static str| {
         let (scene, out) = (example().to_str().unwrap().to_owned(), out.to_str().unwrap().to_owned());
-        let quick = ["--steps", "1", "--refine", "2", "--mirror", "0"];
+        let quick = ["--steps", "1", "--refine", "2", "--mirror", "0", "--turn", "0"];
         let words = [&["reconstruct", &scene, "-o", &out], &quick[..], &["--json", "--holdout", holdout]].concat();
         words.into_iter().map(ToOwned::to_owned).collect::<Vec<_>>()
     };

@@ -1,21 +1,20 @@
 //! The fit from nothing: 3DGS-MCMC.
 
 use crate::{
-    FitConfig, FitError, FitProgress,
+    Evidence, FitConfig, FitError, FitProgress,
     adam::Adam,
     init::random_cloud,
     mcmc::{add_noise, relocate_and_grow},
     objective::{Objective, check_cloud, normalize_rotations},
     views::Targets,
 };
-use freerange_camera::View;
 use freerange_core::Invalid;
 use freerange_splat::Cloud;
 use rand::{SeedableRng, seq::SliceRandom};
 use rand_chacha::ChaCha8Rng;
 use std::ops::ControlFlow;
 
-/// Fits Gaussians to posed views by 3DGS-MCMC (Kheradmand et al. 2024): Adam on the photometric loss, with noise that
+/// Fits Gaussians to posed views, and outlines where there are any, by 3DGS-MCMC (Kheradmand et al. 2024): Adam on the photometric loss, with noise that
 /// lets faint Gaussians explore and relocation of dead ones, which also grows their number.
 ///
 /// Starts from `initial`, or, without it, from random Gaussians where all views see the object. `progress` hears of
@@ -24,14 +23,14 @@ use std::ops::ControlFlow;
 /// # Errors
 /// If there are no views, or they differ in size from their camera; if the configuration is impossible,
 /// `initial` is empty, not finite or larger than `cap_max`; or if the optimisation diverges.
-pub fn fit(
-    views: &[View],
+pub fn fit<'a>(
+    seen: impl Into<Evidence<'a>>,
     initial: Option<&Cloud>,
     config: &FitConfig,
     progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Cloud, FitError> {
     config.check()?;
-    let targets = Targets::new(views, config.render_size)?;
+    let targets = Targets::new(seen, config.render_size)?;
     let mut rng = ChaCha8Rng::seed_from_u64(config.seed);
     let cloud = match initial {
         Some(cloud) => checked(cloud, config.cap_max)?,
@@ -50,14 +49,23 @@ pub(crate) fn optimise(
     mut progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Cloud, FitError> {
     let mut adam = Adam::default();
-    let mut queue = Vec::new();
+    let (mut queue, mut outline_queue) = (Vec::new(), Vec::new());
+    let outlines = targets.cameras.len() - targets.views;
     for step in 0..config.iterations {
         let done = step as f64 / config.iterations as f64;
         let mean_rate = config.rates.mean * (config.final_mean_rate / config.rates.mean).powf(done);
 
-        let chosen = next_views(&mut queue, targets.cameras.len(), config.views_per_step, rng);
+        // Every other step looks at outlines, if there are any.
+        let outlined = outlines > 0 && step % 2 == 1;
+        let chosen = match outlined {
+            true => next_views(&mut outline_queue, outlines, config.views_per_step, rng),
+            false => next_views(&mut queue, targets.views, config.views_per_step, rng),
+        };
         let background = config.background.draw(rng);
-        let mut objective = Objective::photometric(&cloud, targets, &chosen, background, config.lambda_ssim)?;
+        let mut objective = match outlined {
+            true => Objective::outlines(&cloud, targets, &chosen)?,
+            false => Objective::photometric(&cloud, targets, &chosen, background, config.lambda_ssim)?,
+        };
         let loss = objective.loss;
         more(&mut objective, &cloud, background)?;
         objective.add_opacity(&cloud, config.opacity_regularizer);

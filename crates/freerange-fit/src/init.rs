@@ -61,10 +61,10 @@ fn in_unit_ball(rng: &mut ChaCha8Rng) -> DVec3 {
 /// How many views see `point` as transparent, and the mean colour of the others; grey where there is none.
 fn judge(targets: &Targets, point: DVec3) -> (usize, [f32; 3]) {
     let (mut outside, mut inside, mut sum) = (0, 0u32, [0u32; 3]);
-    for pixel in (0..targets.cameras.len()).filter_map(|i| targets.pixel(i, point)) {
+    for (i, pixel) in (0..targets.cameras.len()).filter_map(|i| Some((i, targets.pixel(i, point)?))) {
         if pixel[3] < OPAQUE {
             outside += 1;
-        } else {
+        } else if i < targets.views {
             inside += 1;
             (0..3).for_each(|c| sum[c] += u32::from(pixel[c]));
         }

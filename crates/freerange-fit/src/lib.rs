@@ -3,12 +3,14 @@
 //! * [`fit`]: from nothing but views (Kheradmand et al. 2024), which is how training objects become clouds.
 //! * [`frame_of`]: where a fit says the object is.
 //! * [`find_mirror`]: the plane about which an object is its own mirror image, and [`mirrored`] photos of it.
+//! * [`find_axis`]: the axis about which it may be turned and keeps its outlines, and [`turned`] ones.
 //! * [`psnr_over_white`]: how well Gaussians show what views show.
 //! * [`refine`]: the same from a cloud that is already good, held where no view looks.
 //!
 //! Plain Rust over the rasteriser's CPU functions; no tensor library.
 
 mod adam;
+mod axis;
 mod config;
 mod error;
 mod fit;
@@ -21,10 +23,12 @@ mod objective;
 mod quality;
 mod quick;
 mod refine;
+mod search;
 #[cfg(test)]
 mod tests;
 mod views;
 
+pub use axis::{Axis, FoundAxis, axis_steps, find_axis, turned};
 pub use config::{Background, FitConfig, HoldConfig, Rates, RefineConfig};
 pub use error::FitError;
 pub use fit::fit;
@@ -33,6 +37,7 @@ pub use mirror::{FoundMirror, Mirror, find_mirror, mirror_steps, mirrored};
 pub use quality::{over_white, psnr_over_white, render_over_white};
 pub use quick::{QuickFitConfig, polish, quick_fit, tree_slice};
 pub use refine::refine;
+pub use views::Evidence;
 
 use freerange_splat::Cloud;
 

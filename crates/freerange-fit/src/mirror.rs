@@ -1,15 +1,17 @@
 //! Planes about which an object is its own mirror image: each photo is then one more, from where nobody stood.
 
-use std::{f64::consts::PI, ops::ControlFlow};
+use std::ops::ControlFlow;
 
 use freerange_camera::{Camera, View};
-use freerange_raster::render;
 use freerange_splat::Cloud;
 use glam::{DMat3, DMat4, DVec3};
 use image::imageops::flip_horizontal;
-use rayon::prelude::*;
 
-use crate::{FitError, FitProgress, QuickFitConfig, polish, quick_fit, views::Targets};
+use crate::{
+    FitError, QuickFitConfig,
+    search::{Hull, OUTLINE, PICTURE, ROUNDS, Search, Symmetry, UNCOVERED, difference, going_on, normals, place},
+    views::Targets,
+};
 
 /// A plane: the points p with `normal . p = offset`.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -43,12 +45,25 @@ impl Mirror {
         let world_to_camera = flip * camera.world_to_camera * reflection;
         Camera { cx: f64::from(camera.width) - camera.cx, world_to_camera, ..*camera }
     }
+}
 
-    fn moved(&self, turn: [f64; 2], shift: f64) -> Self {
+impl Symmetry for Mirror {
+    const MIRRORS: bool = true;
+    const WAYS: usize = 3;
+
+    fn cameras(&self, camera: &Camera) -> Vec<Camera> {
+        vec![self.camera(camera)]
+    }
+
+    fn moved(&self, way: usize, step: f64) -> Self {
         let a = self.normal.any_orthonormal_vector();
         let b = self.normal.cross(a);
-        let normal = (self.normal + turn[0] * a + turn[1] * b).normalize();
-        Self { normal, offset: self.offset + shift }
+        let moved = |tilt: DVec3| Self { normal: (self.normal + step * tilt).normalize(), ..*self };
+        match way {
+            0 => moved(a),
+            1 => moved(b),
+            _ => Self { offset: self.offset + 0.5 * step, ..*self },
+        }
     }
 }
 
@@ -63,16 +78,6 @@ pub struct FoundMirror {
     pub doubt: f64,
 }
 
-/// Longest side, in pixels, of the outlines that planes are judged by.
-const OUTLINE: u32 = 64;
-/// Longest side, in pixels, of the pictures that they are judged by.
-const PICTURE: u32 = 128;
-/// Cells along each side of the cube of the visual hull.
-const CELLS: usize = 44;
-/// Half the side of that cube: a little more than the radius of an object in the canonical frame.
-const HALF: f64 = 0.52;
-/// Part of the outlines that what photos and mirrored photos leave of the hull may not fill.
-const UNCOVERED: f64 = 0.01;
 /// Planes whose normals are closer than this, in radians, are one.
 const APART: f64 = 0.2;
 /// Least cosine of the angle between a mirrored photo's direction and the nearest photo's, mean over the photos: where they share nothing,
@@ -87,11 +92,6 @@ const ONE_SIDED: f64 = 0.75;
 const PLACED: usize = 6;
 /// Planes that are fitted to.
 const FITTED: usize = 3;
-/// How often a fitted plane is put in its place by its own fit, and the fit goes on.
-const ROUNDS: usize = 3;
-
-/// Planes that are judged at once.
-const TOGETHER: usize = 8;
 
 /// How many steps [`find_mirror`] tells of.
 pub fn mirror_steps(config: &QuickFitConfig) -> usize {
@@ -117,81 +117,35 @@ pub fn find_mirror(
     mut progress: impl FnMut(usize) -> ControlFlow<()>,
 ) -> Result<Option<FoundMirror>, FitError> {
     config.check()?;
-    let planes = Hull::new(&Targets::new(views, Some(OUTLINE))?).planes();
+    let outlines = Targets::new(views, Some(OUTLINE))?;
+    let planes = planes(&Hull::new(&outlines), &outlines);
     let pictures = Targets::new(views, Some(PICTURE))?;
     let mut search = Search { progress: &mut progress, seed, done: 0 };
     let Some(own) = search.fitted(None, views, config)? else { return Ok(None) };
-    let judge = |plane: Mirror| Ok((difference(&own, &pictures, Some(&plane))?, plane));
+    let put = |cloud: &Cloud, plane: Mirror, reach| {
+        place(plane, [reach, 0.001], |plane| difference(cloud, &pictures, Some(plane), true))
+    };
+    let judge = |plane: Mirror| Ok((difference(&own, &pictures, Some(&plane), true)?, plane));
     let Some(judged) = search.each(planes, judge)? else { return Ok(None) };
     let judged: Vec<Mirror> = best(judged, PLACED).into_iter().map(|(_, plane)| plane).collect();
-    let Some(placed) = search.each(judged, |plane| place(&own, &pictures, plane, 0.04))? else { return Ok(None) };
-    let before = difference(&own, &pictures, None)?;
+    let Some(placed) = search.each(judged, |plane| put(&own, plane, 0.04))? else { return Ok(None) };
+    let before = difference::<Mirror>(&own, &pictures, None, true)?;
     let mut found: Option<FoundMirror> = None;
     for (_, mut plane) in best(placed, FITTED) {
         let both = |plane: &Mirror| [views, &mirrored(views, plane)[..]].concat();
         let Some(mut cloud) = search.fitted(None, &both(&plane), config)? else { return Ok(None) };
         for _ in 0..ROUNDS {
-            (_, plane) = place(&cloud, &pictures, plane, 0.01)?;
+            (_, plane) = put(&cloud, plane, 0.01)?;
             let Some(next) = search.fitted(Some(&cloud), &both(&plane), &going_on(config))? else { return Ok(None) };
             cloud = next;
         }
-        let contradiction = difference(&cloud, &pictures, None)? / before.max(f64::MIN_POSITIVE);
+        let contradiction = difference::<Mirror>(&cloud, &pictures, None, true)? / before.max(f64::MIN_POSITIVE);
         let doubt = contradiction - NEW * (1.0 - beside(&pictures, plane.normal));
         if doubt <= found.map_or(most, |found| found.doubt) {
             found = Some(FoundMirror { mirror: plane, doubt });
         }
     }
     Ok(found)
-}
-
-/// A search that tells how far it is. What it is asked for is none where it was ended.
-struct Search<'a, P> {
-    progress: &'a mut P,
-    seed: u64,
-    done: usize,
-}
-
-impl<P: FnMut(usize) -> ControlFlow<()>> Search<'_, P> {
-    fn fitted(
-        &mut self,
-        start: Option<&Cloud>,
-        views: &[View],
-        config: &QuickFitConfig,
-    ) -> Result<Option<Cloud>, FitError> {
-        let mut ended = false;
-        let tell = |p: &FitProgress<'_>| {
-            let told = (self.progress)(self.done + p.step);
-            ended = told.is_break();
-            told
-        };
-        let cloud = match start {
-            None => quick_fit(views, config, self.seed, tell)?,
-            Some(start) => polish(start, views, config, self.seed, tell)?,
-        };
-        self.done += config.iterations;
-        Ok((!ended).then_some(cloud))
-    }
-
-    /// What `judge` says of each plane. It is asked again and again whether to go on, without being further.
-    fn each(
-        &mut self,
-        planes: Vec<Mirror>,
-        judge: impl Fn(Mirror) -> Result<(f64, Mirror), FitError> + Sync,
-    ) -> Result<Option<Vec<(f64, Mirror)>>, FitError> {
-        let mut judged = Vec::with_capacity(planes.len());
-        for some in planes.chunks(TOGETHER) {
-            judged.extend(some.par_iter().map(|&plane| judge(plane)).collect::<Result<Vec<_>, _>>()?);
-            if (self.progress)(self.done).is_break() {
-                return Ok(None);
-            }
-        }
-        Ok(Some(judged))
-    }
-}
-
-/// A third of a fit.
-fn going_on(config: &QuickFitConfig) -> QuickFitConfig {
-    QuickFitConfig { iterations: config.iterations.div_ceil(ROUNDS), ..config.clone() }
 }
 
 /// At most `most` of the planes, those of the smallest values, no two of which are one.
@@ -211,121 +165,22 @@ pub fn mirrored(views: &[View], mirror: &Mirror) -> Vec<View> {
     views.iter().map(|view| mirror.view(view)).collect()
 }
 
-/// The plane near `plane` from behind which `cloud` looks most like the `views`, and how unlike they are. Turns and shifts begin with
-/// `reach`, in radians and, half of it, in the object's units.
-fn place(cloud: &Cloud, views: &Targets, plane: Mirror, reach: f64) -> Result<(f64, Mirror), FitError> {
-    const LEAST: f64 = 0.001;
-    let value = |plane: &Mirror| difference(cloud, views, Some(plane));
-    let mut best = (value(&plane)?, plane);
-    let mut step = reach;
-    while step > LEAST {
-        let mut better = false;
-        for (turn, shift) in [([1.0, 0.0], 0.0), ([0.0, 1.0], 0.0), ([0.0, 0.0], 0.5)] {
-            for sign in [-step, step] {
-                let next = best.1.moved(turn.map(|t| t * sign), shift * sign);
-                let found = value(&next)?;
-                if found < best.0 {
-                    best = (found, next);
-                    better = true;
-                    break;
-                }
+/// Planes whose mirrored outlines leave enough of the hull to fill the outlines.
+fn planes(hull: &Hull, targets: &Targets) -> Vec<Mirror> {
+    let mut planes = Vec::new();
+    if hull.points.is_empty() || one_sided(targets) {
+        return planes;
+    }
+    for normal in normals().into_iter().filter(|&normal| beside(targets, normal) >= BESIDE) {
+        let middle = hull.middle(normal);
+        for shift in -4..=4 {
+            let plane = Mirror { normal, offset: middle + 0.02 * f64::from(shift) };
+            if hull.uncovered(&[|p| plane.point(p)]) <= UNCOVERED {
+                planes.push(plane);
             }
         }
-        if !better {
-            step *= 0.5;
-        }
     }
-    Ok(best)
-}
-
-/// Mean absolute difference between a cloud and views of it, or what these are from behind a mirror: of colour times alpha, plus that of alpha.
-fn difference(cloud: &Cloud, targets: &Targets, mirror: Option<&Mirror>) -> Result<f64, FitError> {
-    let all: Vec<usize> = (0..targets.cameras.len()).collect();
-    let (mut sum, mut count) = (0.0, 0u32);
-    for (group, raster) in targets.groups(&all) {
-        let own = group.iter().map(|&i| targets.cameras[i]);
-        let cameras: Vec<_> = own.map(|camera| mirror.map_or(camera, |mirror| mirror.camera(&camera))).collect();
-        let output = render(cloud.rows(), &cameras, &vec![[0.0; 3]; group.len()], raster)?;
-        let (width, height) = targets.size(group[0]);
-        let rendered = output.rgb.as_chunks::<3>().0.iter().zip(&output.alpha);
-        for (index, (rgb, alpha)) in rendered.enumerate() {
-            let (image, y, x) = (group[index / (width * height)], index / width % height, index % width);
-            let x = if mirror.is_some() { width - 1 - x } else { x };
-            let [r, g, b, a] = targets.images[image].get_pixel(x as u32, y as u32).0.map(|v| f32::from(v) / 255.0);
-            let color = (rgb[0] - a * r).abs() + (rgb[1] - a * g).abs() + (rgb[2] - a * b).abs();
-            sum += f64::from(color / 3.0 + (alpha - a).abs());
-            count += 1;
-        }
-    }
-    Ok(sum / f64::from(count.max(1)))
-}
-
-/// What lies within the outlines of all views.
-struct Hull<'a> {
-    targets: &'a Targets,
-    cells: Vec<bool>,         // [CELLS, CELLS, CELLS]
-    points: Vec<DVec3>,       // of the cells within
-    pixels: Vec<Vec<usize>>,  // which pixel of each view shows them
-    outlines: Vec<Vec<bool>>, // what each view shows of the object
-}
-
-impl<'a> Hull<'a> {
-    fn new(targets: &'a Targets) -> Self {
-        let outlines: Vec<Vec<bool>> =
-            targets.images.iter().map(|image| image.pixels().map(|p| p[3] >= 128).collect()).collect();
-        let grown: Vec<Vec<bool>> = (0..outlines.len()).map(|i| grown(&outlines[i], targets.size(i))).collect();
-        let mut hull =
-            Self { targets, cells: vec![false; CELLS.pow(3)], points: Vec::new(), pixels: Vec::new(), outlines };
-        let place = |i: usize| ((i as f64 + 0.5) / CELLS as f64 * 2.0 - 1.0) * HALF;
-        for (index, cell) in hull.cells.iter_mut().enumerate() {
-            let at = [index / (CELLS * CELLS), index / CELLS % CELLS, index % CELLS];
-            let point = DVec3::from_array(at.map(place));
-            *cell = (0..grown.len()).all(|i| targets.place(i, point).is_some_and(|p| grown[i][p]));
-            if *cell {
-                hull.points.push(point);
-            }
-        }
-        let pixels = |i| hull.points.iter().map(|&p| targets.place(i, p).expect("within the hull")).collect();
-        hull.pixels = (0..targets.images.len()).map(pixels).collect();
-        hull
-    }
-
-    /// Planes whose mirrored outlines leave enough of the hull to fill the outlines.
-    fn planes(&self) -> Vec<Mirror> {
-        let mut planes = Vec::new();
-        if self.points.is_empty() || one_sided(self.targets) {
-            return planes;
-        }
-        for normal in normals().into_iter().filter(|&normal| beside(self.targets, normal) >= BESIDE) {
-            let along = self.points.iter().map(|p| p.dot(normal));
-            let (low, high) = along.fold((f64::MAX, f64::MIN), |(l, h), x| (l.min(x), h.max(x)));
-            for shift in -4..=4 {
-                let plane = Mirror { normal, offset: 0.5 * (low + high) + 0.02 * f64::from(shift) };
-                if self.uncovered(&plane) <= UNCOVERED {
-                    planes.push(plane);
-                }
-            }
-        }
-        planes
-    }
-
-    fn uncovered(&self, plane: &Mirror) -> f64 {
-        let mut covered: Vec<Vec<bool>> = self.outlines.iter().map(|o| vec![false; o.len()]).collect();
-        for (i, &point) in self.points.iter().enumerate() {
-            let at = (plane.point(point) / HALF + 1.0) * (0.5 * CELLS as f64);
-            let within = at.min_element() >= 0.0 && at.max_element() < CELLS as f64;
-            if within && self.cells[(at.x as usize * CELLS + at.y as usize) * CELLS + at.z as usize] {
-                covered.iter_mut().zip(&self.pixels).for_each(|(covered, pixels)| covered[pixels[i]] = true);
-            }
-        }
-        let (mut all, mut lost) = (0, 0);
-        for (i, outline) in self.outlines.iter().enumerate() {
-            let covered = grown(&covered[i], self.targets.size(i));
-            all += outline.iter().filter(|o| **o).count();
-            lost += outline.iter().zip(covered).filter(|(o, c)| **o && !c).count();
-        }
-        lost as f64 / all.max(1) as f64
-    }
+    planes
 }
 
 fn directions(targets: &Targets) -> Vec<DVec3> {
@@ -345,40 +200,10 @@ fn beside(targets: &Targets, normal: DVec3) -> f64 {
     directions.iter().map(|&d| nearest(d)).sum::<f64>() / directions.len() as f64
 }
 
-/// Half a sphere of directions, fifteen degrees apart.
-fn normals() -> Vec<DVec3> {
-    let mut all = Vec::new();
-    for row in 0..=6 {
-        let elevation = f64::from(row) * PI / 12.0;
-        let count = if row == 6 { 1 } else { (24.0 * elevation.cos()).round() as usize };
-        let (count, turn) = if row == 0 { (12, PI) } else { (count, 2.0 * PI) };
-        for i in 0..count {
-            let azimuth = turn * i as f64 / count as f64;
-            all.push(DVec3::new(azimuth.cos() * elevation.cos(), azimuth.sin() * elevation.cos(), elevation.sin()));
-        }
-    }
-    all
-}
-
-/// A mask and the pixels beside it.
-fn grown(mask: &[bool], (width, height): (usize, usize)) -> Vec<bool> {
-    let mut out = mask.to_vec();
-    for y in 0..height {
-        for x in 0..width {
-            let i = y * width + x;
-            if mask[i] {
-                (x > 0).then(|| out[i - 1] = true);
-                (x + 1 < width).then(|| out[i + 1] = true);
-                (y > 0).then(|| out[i - width] = true);
-                (y + 1 < height).then(|| out[i + width] = true);
-            }
-        }
-    }
-    out
-}
-
 #[cfg(test)]
 mod tests {
+    use std::f64::consts::PI;
+
     use super::*;
     use crate::tests::{ball, cameras, photograph};
     use freerange_splat::channel;

@@ -47,6 +47,29 @@ impl Objective {
         Ok(Self { loss, gradients })
     }
 
+    /// Mean over the `chosen` outlines, counted from the first of them, of the absolute difference of alpha.
+    pub fn outlines(cloud: &Cloud, targets: &Targets, chosen: &[usize]) -> Result<Self, FitError> {
+        let chosen: Vec<usize> = chosen.iter().map(|&i| targets.views + i).collect();
+        let mut whole = Self { loss: 0.0, gradients: vec![0.0; cloud.rows().len()] };
+        for (group, raster) in targets.groups(&chosen) {
+            let cameras: Vec<_> = group.iter().map(|&i| targets.cameras[i]).collect();
+            let output = render(cloud.rows(), &cameras, &vec![[0.0; 3]; group.len()], raster)?;
+            let (width, height) = targets.size(group[0]);
+            let share = 1.0 / (chosen.len() * width * height) as f32;
+            let mut d_alpha = vec![0.0; output.alpha.len()]; // [views, h, w]
+            let pixels = group.iter().flat_map(|&i| targets.images[i].pixels());
+            for ((d, alpha), pixel) in d_alpha.iter_mut().zip(&output.alpha).zip(pixels) {
+                let difference = alpha - f32::from(pixel[3]) / 255.0;
+                whole.loss += f64::from(share * difference.abs());
+                *d = if difference == 0.0 { 0.0 } else { share.copysign(difference) };
+            }
+            let d_rgb = vec![0.0; output.rgb.len()];
+            let gradients = render_backward(cloud.rows(), &output, &d_rgb, &d_alpha, &[])?.gaussians;
+            whole.gradients.iter_mut().zip(gradients).for_each(|(sum, g)| *sum += g);
+        }
+        Ok(whole)
+    }
+
     /// Adds `weight` times the mean opacity.
     pub fn add_opacity(&mut self, cloud: &Cloud, weight: f64) {
         if weight == 0.0 {
@@ -177,7 +200,7 @@ pub(crate) fn normalize_rotations(cloud: &mut Cloud) {
 mod tests {
     use super::*;
     use crate::{
-        HoldConfig,
+        Evidence, HoldConfig,
         hold::Hold,
         tests::{ball, ring},
     };
@@ -227,7 +250,6 @@ mod tests {
         views[2] = ring(3, 40, &ball(12, 1)).remove(2);
         let targets = Targets::new(&views, Some(32)).unwrap();
         assert_eq!(targets.groups(&[0, 1, 2]).map(|(group, _)| group.len()).collect::<Vec<_>>(), [2, 1]);
-        let mut cloud = ball(12, 3);
         let hold = HoldConfig { weight: 0.5, views: 5, size: 24, ..Default::default() };
         let hold = Hold::new(&[ball(12, 2)], &hold).unwrap();
         let value = |cloud: &Cloud| {
@@ -237,6 +259,28 @@ mod tests {
             hold.add(&mut o, cloud, 1, [0.3, 0.6, 0.1]).unwrap();
             o
         };
+        check_gradient(value);
+    }
+
+    #[test]
+    fn gradients_of_outlines_match_finite_differences() {
+        let mut views = ring(4, 24, &ball(12, 1));
+        views[3] = ring(4, 40, &ball(12, 1)).remove(3);
+        let targets = Targets::new(Evidence { views: &views[..1], outlines: &views[1..] }, Some(32)).unwrap();
+        check_gradient(|cloud| Objective::outlines(cloud, &targets, &[0, 2]).unwrap());
+        // Colours are no part of them.
+        let mut grey = ball(12, 3);
+        let colored = Objective::outlines(&grey, &targets, &[1]).unwrap();
+        grey.iter_mut().for_each(|row| row[channel::COLOR].fill(0.5));
+        let found = Objective::outlines(&grey, &targets, &[1]).unwrap();
+        assert_eq!((found.loss, found.gradients), (colored.loss, colored.gradients));
+        // What agrees has nothing to learn but what rounding to bytes leaves.
+        let own = Objective::outlines(&ball(12, 1), &targets, &[0, 1]).unwrap();
+        assert!(own.loss < 2e-3 && colored.loss > 10.0 * own.loss, "{} {}", own.loss, colored.loss);
+    }
+
+    fn check_gradient(value: impl Fn(&Cloud) -> Objective) {
+        let mut cloud = ball(12, 3);
         let gradients = value(&cloud).gradients;
         let largest = gradients.iter().fold(0.0f32, |m, g| m.max(g.abs()));
         assert!(largest > 0.0);

@@ -2,11 +2,10 @@
 
 use std::ops::ControlFlow;
 
-use freerange_camera::View;
 use freerange_splat::{Alignment, Cloud, LodTree};
 use serde::{Deserialize, Serialize};
 
-use crate::{FitConfig, FitError, FitProgress, config::check, fit};
+use crate::{Evidence, FitConfig, FitError, FitProgress, config::check, fit};
 
 /// Settings of [`quick_fit`].
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -50,35 +49,35 @@ impl QuickFitConfig {
     }
 }
 
-/// A short 3DGS-MCMC fit of `views`, which lie in the canonical frame, from the visual hull of their masks.
+/// A short 3DGS-MCMC fit of what is `seen`, which lies in the canonical frame, from the visual hull of their masks.
 ///
 /// # Errors
 /// Those of [`fit`].
-pub fn quick_fit(
-    views: &[View],
+pub fn quick_fit<'a>(
+    seen: impl Into<Evidence<'a>>,
     config: &QuickFitConfig,
     seed: u64,
     progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Cloud, FitError> {
     config.check()?;
-    fit(views, None, &config.config(seed), progress)
+    fit(seen, None, &config.config(seed), progress)
 }
 
-/// `cloud`, moved by as short a fit of `views`: what a sample needs that the views do not look like. It keeps its
+/// `cloud`, moved by as short a fit of what is `seen`: what a sample needs that the views do not look like. It keeps its
 /// number of Gaussians, whatever `config` says of that.
 ///
 /// # Errors
 /// Those of [`fit`].
-pub fn polish(
+pub fn polish<'a>(
     cloud: &Cloud,
-    views: &[View],
+    seen: impl Into<Evidence<'a>>,
     config: &QuickFitConfig,
     seed: u64,
     progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Cloud, FitError> {
     config.check()?;
     let own = QuickFitConfig { gaussians: cloud.len(), ..config.clone() };
-    fit(views, Some(cloud), &own.config(seed), progress)
+    fit(seen, Some(cloud), &own.config(seed), progress)
 }
 
 /// `cloud` as `2^depth` Gaussians in the order of its level-of-detail tree, axes labelled by the world's: as the network

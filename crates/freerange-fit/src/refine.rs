@@ -1,13 +1,12 @@
 //! 3DGS-MCMC that goes on from a cloud that is already good: what a generated sample needs to agree with the photos.
 
 use crate::{
-    FitError, FitProgress, RefineConfig,
+    Evidence, FitError, FitProgress, RefineConfig,
     fit::{checked, next_views, optimise},
     hold::Hold,
     mcmc::split,
     views::Targets,
 };
-use freerange_camera::View;
 use freerange_splat::Cloud;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -25,15 +24,15 @@ use std::ops::ControlFlow;
 /// # Errors
 /// If there are no views, or they differ in size from their camera; if the configuration is impossible;
 /// if the cloud is empty or not finite; or if the optimisation diverges.
-pub fn refine(
+pub fn refine<'a>(
     cloud: &Cloud,
     others: &[Cloud],
-    views: &[View],
+    seen: impl Into<Evidence<'a>>,
     config: &RefineConfig,
     progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Cloud, FitError> {
     config.check()?;
-    let targets = Targets::new(views, config.render_size)?;
+    let targets = Targets::new(seen, config.render_size)?;
     let clouds = std::iter::once(cloud).chain(others).map(|cloud| checked(cloud, usize::MAX));
     let clouds = clouds.collect::<Result<Vec<_>, _>>()?;
     let hold = Hold::new(&clouds, &config.hold)?;

@@ -155,6 +155,31 @@ fn polishing_keeps_the_number_and_comes_nearer() {
 }
 
 /// A cloud as a generator might give it: right on the whole, wrong in detail.
+/// Outlines from further places mend the shape, and tell no colours.
+#[test]
+fn outlines_are_fitted_to() {
+    let scene = ball(40, 12);
+    let photos: Vec<View> = cameras(3, 32, 0.2).iter().map(|c| photograph(&scene, c)).collect();
+    let mut outlines = ring(12, 32, &scene);
+    let config = FitConfig { iterations: 300, cap_max: 100, ..small() };
+    let alone = fit(&photos, None, &config, go).unwrap();
+    let helped = fit(Evidence { views: &photos, outlines: &outlines }, None, &config, go).unwrap();
+    let apart = |cloud: &Cloud| {
+        let views = cameras(5, 32, 1.0).into_iter().map(|c| (photograph(&scene, &c), photograph(cloud, &c)));
+        let each = views.map(|(a, b)| {
+            let pixels = a.image.pixels().zip(b.image.pixels());
+            pixels.map(|(a, b)| f64::from(a[3].abs_diff(b[3]))).sum::<f64>()
+        });
+        each.sum::<f64>()
+    };
+    assert!(apart(&helped) < 0.7 * apart(&alone), "{} {}", apart(&helped), apart(&alone));
+    outlines.iter_mut().for_each(|view| view.image.pixels_mut().for_each(|p| p.0 = [9, 99, 199, p[3]]));
+    let other = fit(Evidence { views: &photos, outlines: &outlines }, None, &config, go).unwrap();
+    assert_eq!(other, helped);
+    let none = Evidence { views: &[], outlines: &outlines };
+    assert!(matches!(fit(none, None, &config, go), Err(FitError::NoViews)));
+}
+
 fn disturbed(cloud: &Cloud, seed: u64) -> Cloud {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut out = cloud.clone();

@@ -7,10 +7,39 @@ use glam::{DMat3, DVec3};
 use image::RgbaImage;
 use rayon::prelude::*;
 
-/// Views, each of its own size.
+/// What a fit is to agree with. Views alone are one, too.
+#[derive(Clone, Copy, Debug)]
+pub struct Evidence<'a> {
+    /// Posed views.
+    pub views: &'a [View],
+    /// More of them, of which the outline alone is looked at: their alpha.
+    pub outlines: &'a [View],
+}
+
+impl<'a> From<&'a [View]> for Evidence<'a> {
+    fn from(views: &'a [View]) -> Self {
+        Self { views, outlines: &[] }
+    }
+}
+
+impl<'a> From<&'a Vec<View>> for Evidence<'a> {
+    fn from(views: &'a Vec<View>) -> Self {
+        views.as_slice().into()
+    }
+}
+
+impl<'a, const N: usize> From<&'a [View; N]> for Evidence<'a> {
+    fn from(views: &'a [View; N]) -> Self {
+        views.as_slice().into()
+    }
+}
+
+/// Views, each of its own size, and after them those of which the outline alone counts.
 pub(crate) struct Targets {
     pub cameras: Vec<Camera>,
     pub images: Vec<RgbaImage>,
+    /// How many of them are more than outlines.
+    pub views: usize,
     rasters: Vec<RasterConfig>,
 }
 
@@ -45,22 +74,25 @@ fn check(view: &View) -> Result<(), FitError> {
 
 impl Targets {
     /// Checks the views and shrinks those whose longest side exceeds `size`.
-    pub fn new(views: &[View], size: Option<u32>) -> Result<Self, FitError> {
-        if views.is_empty() {
+    pub fn new<'a>(seen: impl Into<Evidence<'a>>, size: Option<u32>) -> Result<Self, FitError> {
+        let seen = seen.into();
+        if seen.views.is_empty() {
             return Err(FitError::NoViews);
         }
-        views.iter().try_for_each(check)?;
+        let views: Vec<&View> = seen.views.iter().chain(seen.outlines).collect();
+        views.iter().try_for_each(|view| check(view))?;
         let sizes: Vec<(u32, u32)> = views
             .iter()
             .map(|v| size.map_or(v.image.dimensions(), |size| image_ops::shrunk_size(v.image.dimensions(), size)))
             .collect();
-        let sized = || views.par_iter().zip(&sizes);
+        let sized = || views.par_iter().copied().zip(&sizes);
         let longest = |(w, h): (u32, u32)| w.max(h) as f32;
         let raster =
             |(v, &small): (&View, _)| RasterConfig::default().shrunk(longest(small) / longest(v.image.dimensions()));
         Ok(Self {
             cameras: sized().map(|(v, &(w, h))| v.camera.resized(w, h)).collect(),
             images: sized().map(|(v, &(w, h))| image_ops::resize_area(&v.image, w, h)).collect(),
+            views: seen.views.len(),
             rasters: sized().map(raster).collect(),
         })
     }

@@ -4,8 +4,10 @@ use std::ops::ControlFlow;
 
 use freerange_camera::{CanonicalFrame, FrameConfig, Similarity, View};
 use freerange_fit::{
-    FitProgress, FoundMirror, QuickFitConfig, find_mirror, frame_of, mirror_steps, mirrored, quick_fit,
+    Evidence, FitProgress, FoundAxis, FoundMirror, QuickFitConfig, axis_steps, find_axis, find_mirror, frame_of,
+    mirror_steps, mirrored, quick_fit, turned,
 };
+use freerange_flow::sample::SampleConfig;
 use freerange_splat::Cloud;
 
 use crate::{
@@ -23,6 +25,9 @@ pub(crate) struct Placed {
     pub chosen: Vec<usize>,
     /// These, in the canonical frame, and what is added to them.
     pub shown: Vec<View>,
+    /// Outlines that are known of the object besides, of the views that the model is shown and of all.
+    shown_outlines: Vec<View>,
+    canonical_outlines: Vec<View>,
     /// Whether they are where they are to stay.
     pub settled: bool,
 }
@@ -46,21 +51,32 @@ impl Placed {
                 .push(format!("{uneven} of {all} views are not square: the model is shown squares, cut or padded"));
         }
         let settled = frame.kept;
-        Ok(Self { frame, canonical, chosen, shown, settled })
+        Ok(Self {
+            frame,
+            canonical,
+            chosen,
+            shown,
+            shown_outlines: Vec::new(),
+            canonical_outlines: Vec::new(),
+            settled,
+        })
     }
 
-    /// Adds mirrored photos as further views where the object is its own mirror image: where these doubt it by `most` or less.
-    pub fn mirror(
+    /// Looks for what leaves the object as it is, and adds what that shows of it: mirrored photos as further views, turned outlines as further
+    /// outlines, each where photos contradict it by no more than `sample` allows.
+    pub fn symmetries(
         &mut self,
-        config: &QuickFitConfig,
-        most: f32,
+        sample: &SampleConfig,
         tell: &mut impl FnMut(&Progress<'_>) -> Result<(), Error>,
     ) -> Result<(), Error> {
-        if self.shown.len() > MOST_MIRRORED {
+        if self.shown.len() > MOST_PHOTOS || sample.mirror == 0.0 && sample.turn == 0.0 {
             return Ok(());
         }
+        let config = &sample.start.as_ref().map_or_else(QuickFitConfig::default, |start| start.fit.clone());
         let framing = if self.settled { 0 } else { config.iterations };
-        let total = framing + mirror_steps(config);
+        let turning = if sample.turn > 0.0 { axis_steps(config) } else { 0 };
+        let mirroring = if sample.mirror > 0.0 { mirror_steps(config) } else { 0 };
+        let total = framing + turning + mirroring;
         tell(&Progress::new(Stage::Mirror, 0, total))?;
         let mut stopped = Ok(());
         let mut told = |done, stopped: &mut Result<(), Error>| {
@@ -74,11 +90,34 @@ impl Placed {
             let correction = frame_of(&moved, &self.shown)?;
             self.correct(&correction);
         }
-        let found = find_mirror(&self.shown, config, most.into(), 0, |done| told(framing + done, &mut stopped))?;
-        stopped?;
+        let mut axis = None;
+        if turning > 0 {
+            let most = sample.turn.into();
+            axis = find_axis(&self.shown, config, most, 0, |done| told(framing + done, &mut stopped))?;
+            stopped?;
+            stopped = Ok(());
+        }
+        let mut mirror = None;
+        if mirroring > 0 {
+            let most = sample.mirror.into();
+            let done_before = framing + turning;
+            mirror = find_mirror(&self.shown, config, most, 0, |done| told(done_before + done, &mut stopped))?;
+            stopped?;
+        }
         tell(&Progress::new(Stage::Mirror, total, total))?;
-        if let Some(FoundMirror { mirror, doubt }) = found {
+        if let Some(FoundAxis { axis, contradiction }) = axis {
+            let [x, y, z] = axis.direction.to_array();
+            let most = sample.turn;
+            self.frame.notes.push(format!(
+                "the object is taken to keep its outlines however it is turned about an axis in direction ({x:.2}, {y:.2}, {z:.2}): turned \
+                 outlines are fitted to (contradiction {contradiction:.2}, at most {most})"
+            ));
+            self.shown_outlines = turned(&self.shown, &axis);
+            self.canonical_outlines = turned(&self.canonical, &axis);
+        }
+        if let Some(FoundMirror { mirror, doubt }) = mirror {
             let [x, y, z] = mirror.normal.to_array();
+            let most = sample.mirror;
             self.frame.notes.push(format!(
                 "the object is taken to be its own mirror image about the plane with normal ({x:.2}, {y:.2}, {z:.2}): mirrored photos are \
                  further views (doubt {doubt:.2}, at most {most})"
@@ -87,6 +126,16 @@ impl Placed {
             self.canonical.extend(mirrored(&self.canonical, &mirror));
         }
         Ok(())
+    }
+
+    /// What fits of what the model is shown agree with.
+    pub fn seen(&self) -> Evidence<'_> {
+        Evidence { views: &self.shown, outlines: &self.shown_outlines }
+    }
+
+    /// What a fit of all views agrees with.
+    pub fn all(&self) -> Evidence<'_> {
+        Evidence { views: &self.canonical, outlines: &self.canonical_outlines }
     }
 
     /// A quick fit for each member of the ensemble of each seed, `[members][seeds]`. The first of seed 0 moves frame and views, of
@@ -103,17 +152,17 @@ impl Placed {
         let framing = !self.settled && !numbers.iter().flatten().any(|&number| number == 0);
         let total = (members * seeds.len() + usize::from(framing)) * config.iterations;
         let mut done = 0;
-        let mut fit = |views: &[View], place: Option<&Similarity>, number| {
+        let mut fit = |seen: Evidence<'_>, place: Option<&Similarity>, number| {
             // One fit is enough to look at.
             let place = place.filter(|_| done == 0);
-            let fit = watched(Stage::Fit, 0, place, tell, [done, total], |p| quick_fit(views, config, number, p))?;
+            let fit = watched(Stage::Fit, 0, place, tell, [done, total], |p| quick_fit(seen, config, number, p))?;
             done += config.iterations;
             Ok::<_, Error>(fit)
         };
         // The fit knows better than the masks where the object is; it moves along, so that one is enough.
         let mut first = None;
         if !self.settled {
-            let mut moved = fit(&self.shown, Some(&self.frame.canonical_from_user), 0)?;
+            let mut moved = fit(self.seen(), Some(&self.frame.canonical_from_user), 0)?;
             let correction = frame_of(&moved, &self.shown)?;
             moved.transform(correction.scale, correction.rotation, correction.translation);
             self.correct(&correction);
@@ -121,7 +170,7 @@ impl Placed {
         }
         let mut made = |number| match &first {
             Some(first) if number == 0 => Ok(first.clone()),
-            _ => fit(&self.shown, Some(&self.frame.canonical_from_user), number),
+            _ => fit(self.seen(), Some(&self.frame.canonical_from_user), number),
         };
         numbers.into_iter().map(|seeds| seeds.into_iter().map(&mut made).collect()).collect()
     }
@@ -129,6 +178,8 @@ impl Placed {
     fn correct(&mut self, correction: &Similarity) {
         self.canonical = moved(&self.canonical, correction);
         self.shown = moved(&self.shown, correction);
+        self.shown_outlines = moved(&self.shown_outlines, correction);
+        self.canonical_outlines = moved(&self.canonical_outlines, correction);
         self.frame.canonical_from_user = correction.after(&self.frame.canonical_from_user);
         self.settled = true;
         let (shift, scale) = (correction.translation.length(), correction.scale);
@@ -136,8 +187,8 @@ impl Placed {
     }
 }
 
-/// Photos beyond which nothing is gained by mirrored ones: so many were measured, and the model is shown no more than twice as many.
-const MOST_MIRRORED: usize = 4;
+/// Photos beyond which no symmetries are looked for: so many were measured, and the model is shown no more than twice as many.
+const MOST_PHOTOS: usize = 4;
 
 /// Numbers that the fits of one seed have for its members: as many as `sample.ensemble` allows.
 const MOST_MEMBERS: u64 = 64;

@@ -4,7 +4,7 @@ use std::{ops::ControlFlow, path::Path, time::Instant};
 
 use burn::tensor::Device;
 use freerange_camera::{CanonicalFrame, FrameConfig, Similarity, View, canonical_from_user, inputs_around};
-use freerange_fit::{FitProgress, HoldConfig, QuickFitConfig, RefineConfig, polish, refine, tree_slice};
+use freerange_fit::{Evidence, FitProgress, HoldConfig, QuickFitConfig, RefineConfig, polish, refine, tree_slice};
 use freerange_flow::sample::{Estimate, SampleConfig, StartConfig, reconstruct};
 use freerange_model::Checkpoint;
 use freerange_splat::Cloud;
@@ -146,10 +146,9 @@ impl Reconstructor {
 
         // Samples that nothing is made of have no use for others beside them.
         let members = if options.sample.refine > 0 { options.sample.ensemble } else { 1 };
-        if options.sample.mirror > 0.0 {
+        if options.sample.mirror > 0.0 || options.sample.turn > 0.0 {
             let begin = Instant::now();
-            let fit = options.sample.start.as_ref().map_or_else(QuickFitConfig::default, |start| start.fit.clone());
-            placed.mirror(&fit, options.sample.mirror, &mut tell)?;
+            placed.symmetries(&options.sample, &mut tell)?;
             seconds.push((Stage::Mirror, begin.elapsed().as_secs_f64()));
         }
         let mut fits = Vec::new();
@@ -196,7 +195,7 @@ impl Reconstructor {
             // The other members only help the first: nobody is shown them.
             let place = (member == 0).then_some(&placed.frame.canonical_from_user);
             let sampled = self.sample(
-                &placed.shown,
+                placed.seen(),
                 fits.get(member).map(Vec::as_slice),
                 options,
                 member as u64,
@@ -208,11 +207,11 @@ impl Reconstructor {
         Ok(clouds)
     }
 
-    /// One cloud per seed, of member `member` of an ensemble, for views in the canonical frame and their quick fits, one per seed,
+    /// One cloud per seed, of member `member` of an ensemble, for views and outlines in the canonical frame and their quick fits, one per seed,
     /// if sampling starts from them. Estimates are shown where there is a `place`.
     fn sample(
         &self,
-        views: &[View],
+        seen: Evidence<'_>,
         fits: Option<&[Cloud]>,
         options: &Options,
         member: u64,
@@ -226,12 +225,13 @@ impl Reconstructor {
         }
         // The first member is what it is without the others, which draw from far away.
         let seeds: Vec<u64> = options.seeds.iter().map(|seed| seed.wrapping_add(member << 32)).collect();
+        let views = seen.views;
         let mut clouds = self.network(views, fits, config, &seeds, place, steps)?;
         if config.polishing() > 0 {
             let quick = QuickFitConfig { iterations: config.polishing(), ..QuickFitConfig::default() };
             for (cloud, &seed) in clouds.iter_mut().zip(&seeds) {
                 let done = [steps.done, steps.total];
-                *cloud = watched(Stage::Sample, 0, None, steps.tell, done, |p| polish(cloud, views, &quick, seed, p))?;
+                *cloud = watched(Stage::Sample, 0, None, steps.tell, done, |p| polish(cloud, seen, &quick, seed, p))?;
                 steps.done += quick.iterations;
             }
         }
@@ -332,8 +332,7 @@ fn finished(
                 false => HoldConfig { weight: 0.3, views: 24, ..HoldConfig::default() },
             };
             let config = RefineConfig { steps, hold, seed, ..RefineConfig::default() };
-            let fit =
-                |p: &mut dyn FnMut(&FitProgress<'_>) -> _| refine(&plain, &members, &placed.canonical, &config, p);
+            let fit = |p: &mut dyn FnMut(&FitProgress<'_>) -> _| refine(&plain, &members, placed.all(), &config, p);
             let refined = watched(Stage::Refine, i, Some(place), tell, [0, steps], fit)?;
             (refined, Some(to_user(&plain, place)))
         }

@@ -24,7 +24,7 @@ fn short(model: &Reconstructor) -> Options {
     options.seeds = vec![4, 5];
     options.sample.refine = 4;
     options.sample.ensemble = 1;
-    options.sample.mirror = 0.0;
+    (options.sample.mirror, options.sample.turn) = (0.0, 0.0);
     options
 }
 
@@ -186,6 +186,44 @@ fn mirrored_photos_are_further_views() {
     }
 }
 
+/// A bowl may be turned about its axis: turned outlines are fitted to, and the user is told so, in one stage with mirrored photos.
+#[test]
+fn turned_outlines_are_fitted_to() {
+    let model = model();
+    let views = bowl();
+    let mut options = short(&model);
+    options.seeds.truncate(1);
+    let run = |mirror, turn, refine| {
+        let mut options = options.clone();
+        (options.sample.mirror, options.sample.turn, options.sample.refine) = (mirror, turn, refine);
+        let mut told = Vec::new();
+        let made = model.run(&views, &options, &mut |p| {
+            told.push((p.stage, p.done, p.total));
+            ControlFlow::Continue(())
+        });
+        let made = made.unwrap();
+        let noted = ["mirror image", "keep its outlines"].map(|what| made.notes.iter().any(|n| n.contains(what)));
+        told.retain(|t| t.0 == Stage::Mirror);
+        (noted, made, told)
+    };
+    let (noted, without, told) = run(0.0, 0.0, 0);
+    assert!(noted == [false, false] && told.is_empty());
+    let (noted, contradicted, _) = run(0.0, 1e-6, 0);
+    assert_eq!((noted, &contradicted.samples[0].gaussians), ([false, false], &without.samples[0].gaussians));
+    let (noted, turned, _) = run(0.0, 100.0, 0);
+    assert_eq!(noted, [false, true]);
+    assert_ne!(turned.samples[0].gaussians, without.samples[0].gaussians);
+    let (noted, both, told) = run(100.0, 100.0, 0);
+    assert_eq!(noted, [true, true]);
+    assert_ne!(both.samples[0].gaussians, turned.samples[0].gaussians);
+    let (first, last) = (told[0], told[told.len() - 1]);
+    assert!(first.1 == 0 && last.1 == last.2, "{first:?} {last:?}");
+    assert!(told.windows(2).all(|pair| pair[0].1 <= pair[1].1 && pair[0].2 == pair[1].2), "one stage");
+    // Refinement is held to them as well.
+    let [plain, held] = [0.0, 100.0].map(|turn| run(0.0, turn, 3).1.samples.remove(0));
+    assert_ne!(plain.gaussians, held.gaussians);
+}
+
 /// From pure noise; what is mended or polished starts from that sample and stays near it.
 #[test]
 fn a_sample_from_noise_is_mended() {
@@ -328,7 +366,8 @@ fn photos_of_any_shape_and_size_are_seen_undistorted() {
     let squares = photos.each_ref().map(|v| Window::around(v).cut(v).into_owned());
     assert_eq!(squares.each_ref().map(|v| v.image.dimensions()), [(512, 512), (512, 512), (300, 300), (512, 512)]);
     let mut options = model.options().unwrap();
-    options.sample = SampleConfig { steps: 4, mirror: 0.0, polish: 0, refine: 0, ..options.sample.without_start() };
+    options.sample =
+        SampleConfig { steps: 4, mirror: 0.0, turn: 0.0, polish: 0, refine: 0, ..options.sample.without_start() };
     let run = |views: &[View], options: &Options| model.run(views, options, &mut go).unwrap().samples.remove(0);
     // What the network and its guidance see of a photo is what a square camera would have seen.
     assert_eq!(run(&photos, &options).gaussians, run(&squares, &options).gaussians);

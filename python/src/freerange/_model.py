@@ -119,7 +119,7 @@ class Model:
         direction. `center`, `radius`: where the object is, if that is known. `on_step`: called with a `Step` after each; what it
         raises ends the work, as Ctrl-C does.
 
-        Further options are those of the command line, by default the checkpoint's: `steps`, `refine`, `ensemble`, `polish`, `mend`, `regroup`, `mirror`,
+        Further options are those of the command line, by default the checkpoint's: `steps`, `refine`, `ensemble`, `polish`, `mend`, `regroup`, `mirror`, `turn`,
         `start` ("fit" or "noise"), `depth`, `cfg_scale`, `lambda_pg`, `solver`, `compute`, `views`.
         """
         seeds, sampling = _sampling(seed, options)
@@ -154,7 +154,7 @@ class Model:
 
 
 _COUNTS = {"steps": 1, "refine": 0, "ensemble": 1, "polish": 0, "mend": 0, "regroup": 0, "depth": 1, "views": 1}
-_NUMBERS = ("cfg_scale", "lambda_pg", "mirror")
+_NUMBERS = ("cfg_scale", "lambda_pg", "mirror", "turn")
 _NAMES = ("start", "solver", "compute")
 
 

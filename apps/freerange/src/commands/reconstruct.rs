@@ -109,6 +109,10 @@ pub struct Sampling {
     /// it by at most so much; 0 is never [default: the checkpoint's].
     #[arg(long, value_name = "MOST")]
     pub mirror: Option<f32>,
+    /// Fit to outlines turned about the object's axis as well where, by a fit of both, the photos contradict them by at most so much;
+    /// 0 is never [default: the checkpoint's].
+    #[arg(long, value_name = "MOST")]
+    pub turn: Option<f32>,
     /// Seed of the (first) sample.
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
@@ -203,6 +207,7 @@ impl Sampling {
         sample.mend = self.mend.unwrap_or(sample.mend);
         sample.regroup = self.regroup.unwrap_or(sample.regroup);
         sample.mirror = self.mirror.unwrap_or(sample.mirror);
+        sample.turn = self.turn.unwrap_or(sample.turn);
         sample.ensemble = self.ensemble.map_or(sample.ensemble, usize::from);
         options.seeds = (0..u64::from(samples)).map(|i| self.seed.wrapping_add(i)).collect();
         options.frame.up = self.up.or_z();

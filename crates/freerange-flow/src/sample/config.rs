@@ -55,6 +55,10 @@ pub struct SampleConfig {
     /// [`reconstruct`](super::reconstruct) itself takes what it is given.
     #[serde(skip_serializing_if = "is_nothing")]
     pub mirror: f32,
+    /// Most that photos may [contradict](freerange_fit::FoundAxis::contradiction) an axis about which the object keeps its outlines for turned
+    /// outlines to be more of what every fit agrees with. 0: none is looked for. [`reconstruct`](super::reconstruct) itself knows of none.
+    #[serde(skip_serializing_if = "is_nothing")]
+    pub turn: f32,
     /// Steps of 3DGS-MCMC on the input views that follow ([`freerange_fit::refine`]); [`reconstruct`](super::reconstruct)
     /// itself takes none.
     pub refine: usize,
@@ -123,6 +127,7 @@ impl Default for SampleConfig {
             coupling: Coupling::Independent,
             compute: Compute::F32,
             mirror: 0.0,
+            turn: 0.0,
             refine: 0,
             ensemble: 1,
             polish: 0,
@@ -187,8 +192,10 @@ impl SampleConfig {
         if self.mend > 10_000 {
             return bad("mend", "0 to 10000", self.mend.to_string());
         }
-        if !(0.0..=100.0).contains(&self.mirror) {
-            return bad("mirror", "0 to 100", self.mirror.to_string());
+        for (field, most) in [("mirror", self.mirror), ("turn", self.turn)] {
+            if !(0.0..=100.0).contains(&most) {
+                return bad(field, "0 to 100", most.to_string());
+            }
         }
         if self.refine > 100_000 {
             return bad("refine", "0 to 100000", self.refine.to_string());
