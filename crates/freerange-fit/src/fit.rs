@@ -55,7 +55,7 @@ pub(crate) fn optimise(
         let done = step as f64 / config.iterations as f64;
         let mean_rate = config.rates.mean * (config.final_mean_rate / config.rates.mean).powf(done);
 
-        // Every other step looks at outlines, if there are any.
+        // Every other step looks at outlines alone, if there are any.
         let outlined = outlines > 0 && step % 2 == 1;
         let chosen = match outlined {
             true => next_views(&mut outline_queue, outlines, config.views_per_step, rng),
@@ -63,9 +63,12 @@ pub(crate) fn optimise(
         };
         let background = config.background.draw(rng);
         let mut objective = match outlined {
-            true => Objective::outlines(&cloud, targets, &chosen)?,
+            true => Objective::none(&cloud),
             false => Objective::photometric(&cloud, targets, &chosen, background, config.lambda_ssim)?,
         };
+        if outlined {
+            objective.add_outlines(&cloud, targets, &chosen)?;
+        }
         let loss = objective.loss;
         more(&mut objective, &cloud, background)?;
         objective.add_opacity(&cloud, config.opacity_regularizer);

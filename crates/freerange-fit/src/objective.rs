@@ -47,10 +47,14 @@ impl Objective {
         Ok(Self { loss, gradients })
     }
 
-    /// Mean over the `chosen` outlines, counted from the first of them, of the absolute difference of alpha.
-    pub fn outlines(cloud: &Cloud, targets: &Targets, chosen: &[usize]) -> Result<Self, FitError> {
+    /// Nothing that there would be to learn.
+    pub fn none(cloud: &Cloud) -> Self {
+        Self { loss: 0.0, gradients: vec![0.0; cloud.rows().len()] }
+    }
+
+    /// Adds the mean over the `chosen` outlines, counted from the first of them, of the absolute difference of alpha.
+    pub fn add_outlines(&mut self, cloud: &Cloud, targets: &Targets, chosen: &[usize]) -> Result<(), FitError> {
         let chosen: Vec<usize> = chosen.iter().map(|&i| targets.views + i).collect();
-        let mut whole = Self { loss: 0.0, gradients: vec![0.0; cloud.rows().len()] };
         for (group, raster) in targets.groups(&chosen) {
             let cameras: Vec<_> = group.iter().map(|&i| targets.cameras[i]).collect();
             let output = render(cloud.rows(), &cameras, &vec![[0.0; 3]; group.len()], raster)?;
@@ -60,14 +64,14 @@ impl Objective {
             let pixels = group.iter().flat_map(|&i| targets.images[i].pixels());
             for ((d, alpha), pixel) in d_alpha.iter_mut().zip(&output.alpha).zip(pixels) {
                 let difference = alpha - f32::from(pixel[3]) / 255.0;
-                whole.loss += f64::from(share * difference.abs());
+                self.loss += f64::from(share * difference.abs());
                 *d = if difference == 0.0 { 0.0 } else { share.copysign(difference) };
             }
             let d_rgb = vec![0.0; output.rgb.len()];
             let gradients = render_backward(cloud.rows(), &output, &d_rgb, &d_alpha, &[])?.gaussians;
-            whole.gradients.iter_mut().zip(gradients).for_each(|(sum, g)| *sum += g);
+            self.gradients.iter_mut().zip(gradients).for_each(|(sum, g)| *sum += g);
         }
-        Ok(whole)
+        Ok(())
     }
 
     /// Adds `weight` times the mean opacity.
@@ -267,15 +271,20 @@ mod tests {
         let mut views = ring(4, 24, &ball(12, 1));
         views[3] = ring(4, 40, &ball(12, 1)).remove(3);
         let targets = Targets::new(Evidence { views: &views[..1], outlines: &views[1..] }, Some(32)).unwrap();
-        check_gradient(|cloud| Objective::outlines(cloud, &targets, &[0, 2]).unwrap());
+        let outlines = |cloud: &Cloud, chosen: &[usize]| {
+            let mut objective = Objective::none(cloud);
+            objective.add_outlines(cloud, &targets, chosen).unwrap();
+            objective
+        };
+        check_gradient(|cloud| outlines(cloud, &[0, 2]));
         // Colours are no part of them.
         let mut grey = ball(12, 3);
-        let colored = Objective::outlines(&grey, &targets, &[1]).unwrap();
+        let colored = outlines(&grey, &[1]);
         grey.iter_mut().for_each(|row| row[channel::COLOR].fill(0.5));
-        let found = Objective::outlines(&grey, &targets, &[1]).unwrap();
+        let found = outlines(&grey, &[1]);
         assert_eq!((found.loss, found.gradients), (colored.loss, colored.gradients));
         // What agrees has nothing to learn but what rounding to bytes leaves.
-        let own = Objective::outlines(&ball(12, 1), &targets, &[0, 1]).unwrap();
+        let own = outlines(&ball(12, 1), &[0, 1]);
         assert!(own.loss < 2e-3 && colored.loss > 10.0 * own.loss, "{} {}", own.loss, colored.loss);
     }
 

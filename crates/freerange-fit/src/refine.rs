@@ -5,6 +5,7 @@ use crate::{
     fit::{checked, next_views, optimise},
     hold::Hold,
     mcmc::split,
+    objective::Objective,
     views::Targets,
 };
 use freerange_splat::Cloud;
@@ -19,6 +20,7 @@ use std::ops::ControlFlow;
 /// more view to agree with, though less. `others` are more clouds of the same object. These pictures are the mean of all:
 /// where guesses differ, their mean is nearer to the truth than most. For the same reason the refinement begins with as many
 /// of them in one place as there are to be Gaussians, each fainter, so that together they show about what one alone does.
+/// Outlines, where there are any, come beside the views at every other step.
 /// `progress` hears of every step, and ends with what there is by `ControlFlow::Break`. The same input gives the same bytes.
 ///
 /// # Errors
@@ -32,7 +34,9 @@ pub fn refine<'a>(
     progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Cloud, FitError> {
     config.check()?;
-    let targets = Targets::new(seen, config.render_size)?;
+    let seen = seen.into();
+    let targets = Targets::new(seen.views, config.render_size)?;
+    let outlines = Targets::new(seen, config.render_size)?;
     let clouds = std::iter::once(cloud).chain(others).map(|cloud| checked(cloud, usize::MAX));
     let clouds = clouds.collect::<Result<Vec<_>, _>>()?;
     let hold = Hold::new(&clouds, &config.hold)?;
@@ -44,11 +48,19 @@ pub fn refine<'a>(
     let mut hold_rng = ChaCha8Rng::seed_from_u64(config.seed);
     hold_rng.set_stream(1);
     let mut queue = Vec::new();
-    let holding = |objective: &mut _, cloud: &_, background| {
+    // Photos have more to tell here than shape: outlines come beside them, at every other step.
+    let (mut outline_queue, mut step) = (Vec::new(), 0);
+    let count = outlines.cameras.len() - outlines.views;
+    let more = |objective: &mut Objective, cloud: &Cloud, background| {
+        step += 1;
+        if count > 0 && step % 2 == 0 {
+            let chosen = next_views(&mut outline_queue, count, 1, &mut hold_rng);
+            objective.add_outlines(cloud, &outlines, &chosen)?;
+        }
         let chosen = next_views(&mut queue, hold.views(), 1, &mut hold_rng);
         chosen.into_iter().try_for_each(|view| hold.add(objective, cloud, view, background))
     };
-    optimise(start, &targets, &fit, &mut rng, holding, progress)
+    optimise(start, &targets, &fit, &mut rng, more, progress)
 }
 
 /// As many of `clouds` as `most` Gaussians allow, but the first in any case, in one place. Each Gaussian becomes what relocation

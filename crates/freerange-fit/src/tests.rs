@@ -173,6 +173,12 @@ fn outlines_are_fitted_to() {
         each.sum::<f64>()
     };
     assert!(apart(&helped) < 0.7 * apart(&alone), "{} {}", apart(&helped), apart(&alone));
+    let config_of_refinement = RefineConfig { steps: 200, gaussians: 100, ..RefineConfig::default() };
+    let [plain, outlined] = [&[][..], &outlines].map(|outlines| {
+        let seen = Evidence { views: &photos, outlines };
+        refine(&alone, &[], seen, &config_of_refinement, go).unwrap()
+    });
+    assert!(apart(&outlined) < 0.8 * apart(&plain), "{} {}", apart(&outlined), apart(&plain));
     outlines.iter_mut().for_each(|view| view.image.pixels_mut().for_each(|p| p.0 = [9, 99, 199, p[3]]));
     let other = fit(Evidence { views: &photos, outlines: &outlines }, None, &config, go).unwrap();
     assert_eq!(other, helped);
