@@ -6,6 +6,7 @@ use freerange_camera::{Camera, View};
 use freerange_splat::Cloud;
 use glam::{DMat3, DMat4, DVec3};
 use image::imageops::flip_horizontal;
+use rayon::prelude::*;
 
 use crate::{
     FitError, QuickFitConfig,
@@ -167,20 +168,16 @@ pub fn mirrored(views: &[View], mirror: &Mirror) -> Vec<View> {
 
 /// Planes whose mirrored outlines leave enough of the hull to fill the outlines.
 fn planes(hull: &Hull, targets: &Targets) -> Vec<Mirror> {
-    let mut planes = Vec::new();
     if hull.points.is_empty() || one_sided(targets) {
-        return planes;
+        return Vec::new();
     }
-    for normal in normals().into_iter().filter(|&normal| beside(targets, normal) >= BESIDE) {
+    let normals = normals().into_par_iter().filter(|&normal| beside(targets, normal) >= BESIDE);
+    let through = |normal: DVec3| {
         let middle = hull.middle(normal);
-        for shift in -4..=4 {
-            let plane = Mirror { normal, offset: middle + 0.02 * f64::from(shift) };
-            if hull.uncovered(&[|p| plane.point(p)]) <= UNCOVERED {
-                planes.push(plane);
-            }
-        }
-    }
-    planes
+        let planes = (-4..=4).map(move |shift| Mirror { normal, offset: middle + 0.02 * f64::from(shift) });
+        planes.filter(|plane| hull.uncovered(&[|p| plane.point(p)]) <= UNCOVERED).collect::<Vec<_>>()
+    };
+    normals.flat_map_iter(through).collect()
 }
 
 fn directions(targets: &Targets) -> Vec<DVec3> {
