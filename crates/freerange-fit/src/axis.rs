@@ -40,6 +40,7 @@ impl Symmetry for Axis {
     const MIRRORS: bool = false;
     const WAYS: usize = 4;
 
+    // Some of the turns are enough to judge by: the quarters, and one between.
     fn cameras(&self, camera: &Camera) -> Vec<Camera> {
         [2.0, 3.0, 4.0, 6.0].iter().map(|turn| self.camera(camera, turn / f64::from(TURNS))).collect()
     }

@@ -48,7 +48,7 @@ pub struct FitProgress<'a> {
     pub step: usize,
     /// Steps in all.
     pub steps: usize,
-    /// Photometric loss before the last step, on the views it looked at.
+    /// Loss before the last step, on what it looked at: photometric on views; of alpha, at every other step of a fit, on outlines if there are any.
     pub loss: f64,
     /// Number of Gaussians.
     pub gaussians: usize,

@@ -49,7 +49,7 @@ impl QuickFitConfig {
     }
 }
 
-/// A short 3DGS-MCMC fit of what is `seen`, which lies in the canonical frame, from the visual hull of their masks.
+/// A short 3DGS-MCMC fit of what is `seen`, which lies in the canonical frame, from the visual hull of the masks.
 ///
 /// # Errors
 /// Those of [`fit`].

@@ -36,7 +36,7 @@ pub fn refine<'a>(
     config.check()?;
     let seen = seen.into();
     let targets = Targets::new(seen.views, config.render_size)?;
-    let outlines = Targets::new(seen, config.render_size)?;
+    let outlines = (!seen.outlines.is_empty()).then(|| Targets::new(seen, config.render_size)).transpose()?;
     let clouds = std::iter::once(cloud).chain(others).map(|cloud| checked(cloud, usize::MAX));
     let clouds = clouds.collect::<Result<Vec<_>, _>>()?;
     let hold = Hold::new(&clouds, &config.hold)?;
@@ -50,12 +50,11 @@ pub fn refine<'a>(
     let mut queue = Vec::new();
     // Photos have more to tell here than shape: outlines come beside them, at every other step.
     let (mut outline_queue, mut step) = (Vec::new(), 0);
-    let count = outlines.cameras.len() - outlines.views;
     let more = |objective: &mut Objective, cloud: &Cloud, background| {
         step += 1;
-        if count > 0 && step % 2 == 0 {
-            let chosen = next_views(&mut outline_queue, count, 1, &mut hold_rng);
-            objective.add_outlines(cloud, &outlines, &chosen)?;
+        if let Some(outlines) = outlines.as_ref().filter(|_| step % 2 == 0) {
+            let chosen = next_views(&mut outline_queue, seen.outlines.len(), 1, &mut hold_rng);
+            objective.add_outlines(cloud, outlines, &chosen)?;
         }
         let chosen = next_views(&mut queue, hold.views(), 1, &mut hold_rng);
         chosen.into_iter().try_for_each(|view| hold.add(objective, cloud, view, background))

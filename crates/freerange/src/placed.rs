@@ -69,7 +69,7 @@ impl Placed {
         sample: &SampleConfig,
         tell: &mut impl FnMut(&Progress<'_>) -> Result<(), Error>,
     ) -> Result<(), Error> {
-        if self.shown.len() > MOST_PHOTOS || sample.mirror == 0.0 && sample.turn == 0.0 {
+        if self.shown.len() > MOST_PHOTOS {
             return Ok(());
         }
         let config = &sample.start.as_ref().map_or_else(QuickFitConfig::default, |start| start.fit.clone());
@@ -100,8 +100,8 @@ impl Placed {
         let mut mirror = None;
         if mirroring > 0 {
             let most = sample.mirror.into();
-            let done_before = framing + turning;
-            mirror = find_mirror(&self.shown, config, most, 0, |done| told(done_before + done, &mut stopped))?;
+            let tell = |done| told(framing + turning + done, &mut stopped);
+            mirror = find_mirror(&self.shown, config, most, 0, tell)?;
             stopped?;
         }
         tell(&Progress::new(Stage::Mirror, total, total))?;

@@ -13,7 +13,7 @@ use crate::{Error, to_user};
 pub enum Stage {
     /// Finds where the object is.
     Frame,
-    /// Looks for the plane about which the object is its own mirror image.
+    /// Looks for the plane about which the object is its own mirror image, and the axis about which it keeps its outlines.
     Mirror,
     /// Fits Gaussians to the views quickly, for sampling to start from.
     Fit,

@@ -19,7 +19,7 @@ from ._scene import Scene
 class Step:
     """How far a reconstruction has come."""
 
-    #: "frame", "mirror", "fit", "sample" or "refine", in this order; "mirror" where mirrored photos are looked for.
+    #: "frame", "mirror", "fit", "sample" or "refine", in this order; "mirror" where mirrored photos or turned outlines are looked for.
     stage: str
     #: Which of the samples, where they are worked on one after the other: in "refine".
     sample: int
