@@ -7,7 +7,7 @@ use freerange_splat::Cloud;
 use glam::{DMat4, DVec3};
 
 use crate::{
-    Evidence, FitError, QuickFitConfig,
+    Evidence, FitError, Outline, QuickFitConfig,
     search::{Hull, OUTLINE, PICTURE, ROUNDS, Search, Symmetry, UNCOVERED, difference, going_on, normals, place},
     views::Targets,
 };
@@ -70,15 +70,15 @@ const PLACED: usize = 8;
 
 /// How many steps [`find_axis`] tells of.
 pub fn axis_steps(config: &QuickFitConfig) -> usize {
-    2 * config.iterations + ROUNDS * going_on(config).iterations
+    config.iterations + ROUNDS * going_on(config).iterations
 }
 
 /// The axis about which an object may be turned and keeps its outlines, as far as photos of it tell: none where they contradict it by more than
 /// `most` (see [`FoundAxis::contradiction`]), or no axis suits their outlines. Colours need not be the same all around. `views` lie in the
-/// canonical frame, and may all be from one side.
+/// canonical frame, and may all be from one side; `own` is a [`quick_fit`](crate::quick_fit) of them.
 ///
 /// What lies within all outlines, and within all turned ones, has to fill the outlines. Axes through the middle of the hull, in all directions,
-/// fifteen degrees apart: those that leave most of the outlines filled are moved to where they leave more. The best of them is moved to where a quick
+/// fifteen degrees apart: those that leave most of the outlines filled are moved to where they leave more. The best of them is moved to where that
 /// fit of the photos, then one of photos and turned outlines, looks most like the outlines when it is turned.
 /// `progress` hears how many of [`axis_steps`] are done, of some more than once, and ends the search, with none, by `ControlFlow::Break`.
 ///
@@ -86,6 +86,7 @@ pub fn axis_steps(config: &QuickFitConfig) -> usize {
 /// Those of [`fit`](crate::fit()).
 pub fn find_axis(
     views: &[View],
+    own: &Cloud,
     config: &QuickFitConfig,
     most: f64,
     seed: u64,
@@ -119,14 +120,13 @@ pub fn find_axis(
     let pictures = Targets::new(views, Some(PICTURE))?;
     let put =
         |cloud: &Cloud, axis: Axis, reach| place(axis, reach, |axis| difference(cloud, &outlines, Some(axis), false));
-    let Some(own) = search.fitted(None, views, config)? else { return Ok(None) };
-    let before = difference::<Axis>(&own, &pictures, None, false)?;
-    (_, axis) = put(&own, axis, [0.04, 0.004])?;
-    let both = Evidence { views, outlines: &turned(views, &axis) };
+    let before = difference::<Axis>(own, &pictures, None, false)?;
+    (_, axis) = put(own, axis, [0.04, 0.004])?;
+    let both = Evidence { views, outlines: turned(views, &axis) };
     let Some(mut cloud) = search.fitted(None, both, config)? else { return Ok(None) };
     for _ in 0..ROUNDS {
         (_, axis) = put(&cloud, axis, [0.01, 0.002])?;
-        let both = Evidence { views, outlines: &turned(views, &axis) };
+        let both = Evidence { views, outlines: turned(views, &axis) };
         let Some(next) = search.fitted(Some(&cloud), both, &going_on(config))? else { return Ok(None) };
         cloud = next;
     }
@@ -134,12 +134,12 @@ pub fn find_axis(
     Ok((contradiction <= most).then_some(FoundAxis { axis, contradiction }))
 }
 
-/// The views from all around the axis: whoever is sure of outlines alone may take theirs.
-pub fn turned(views: &[View], axis: &Axis) -> Vec<View> {
-    let turned = |view: &View, i: u32| View {
-        name: format!("{} turned", view.name),
+/// The outlines of the views, turned all around the axis.
+pub fn turned<'a>(views: &'a [View], axis: &Axis) -> Vec<Outline<'a>> {
+    let axis = *axis;
+    let turned = move |view: &'a View, i: u32| Outline {
         camera: axis.camera(&view.camera, f64::from(i) / f64::from(TURNS)),
-        image: view.image.clone(),
+        ..view.into()
     };
     (1..TURNS).flat_map(|i| views.iter().map(move |view| turned(view, i))).collect()
 }
@@ -147,7 +147,7 @@ pub fn turned(views: &[View], axis: &Axis) -> Vec<View> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::tests::{cameras, photograph};
+    use crate::tests::{cameras, own, photograph};
     use freerange_splat::channel;
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
@@ -190,9 +190,9 @@ mod tests {
         let view = photograph(&cloud, &camera);
         let all = turned(std::slice::from_ref(&view), &AXIS);
         assert_eq!(all.len(), 7);
-        let height = |view: &View| (view.camera.center() - AXIS.point).dot(AXIS.direction);
+        let height = |camera: &Camera| (camera.center() - AXIS.point).dot(AXIS.direction);
         for (i, seen) in (1..8).zip(&all) {
-            assert!((height(seen) - height(&view)).abs() < 1e-9);
+            assert!((height(&seen.camera) - height(&view.camera)).abs() < 1e-9);
             let mut object = cloud.clone();
             for row in object.iter_mut() {
                 let mean = DVec3::from_array([0, 1, 2].map(|k| f64::from(row[channel::MEAN.start + k])));
@@ -207,7 +207,9 @@ mod tests {
 
     #[test]
     fn what_keeps_its_outlines_is_told_from_what_does_not() {
-        let find = |views: &[View], most| find_axis(views, &QUICK, most, 0, |_| ControlFlow::Continue(())).unwrap();
+        let find = |views: &[View], most| {
+            find_axis(views, &own(views, &QUICK), &QUICK, most, 0, |_| ControlFlow::Continue(())).unwrap()
+        };
         let all = photos(&vase(false));
         let one_side: Vec<View> = [-0.4f64, -0.1, 0.2, 0.5]
             .iter()
@@ -234,7 +236,8 @@ mod tests {
         let config = QuickFitConfig { iterations: 7, gaussians: 30, render_size: 32 };
         let views = photos(&vase(false));
         let mut told = Vec::new();
-        find_axis(&views, &config, f64::INFINITY, 0, |done| {
+        let own = own(&views, &config);
+        find_axis(&views, &own, &config, f64::INFINITY, 0, |done| {
             told.push(done);
             ControlFlow::Continue(())
         })
@@ -244,12 +247,12 @@ mod tests {
         assert!(told.iter().copied().eq(0..=axis_steps(&config)), "{told:?}");
         for last in [0, 1, 9, 16] {
             let mut reached = 0;
-            let found = find_axis(&views, &config, f64::INFINITY, 0, |done| {
+            let found = find_axis(&views, &own, &config, f64::INFINITY, 0, |done| {
                 reached = done;
                 if done == last { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
             });
             assert!(found.unwrap().is_none() && reached == last, "{last}: {reached}");
         }
-        assert!(find_axis(&[], &config, f64::INFINITY, 0, |_| ControlFlow::Continue(())).is_err());
+        assert!(find_axis(&[], &own, &config, f64::INFINITY, 0, |_| ControlFlow::Continue(())).is_err());
     }
 }

@@ -37,7 +37,7 @@ pub use mirror::{FoundMirror, Mirror, find_mirror, mirror_steps, mirrored};
 pub use quality::{over_white, psnr_over_white, render_over_white};
 pub use quick::{QuickFitConfig, polish, quick_fit, tree_slice};
 pub use refine::refine;
-pub use views::Evidence;
+pub use views::{Evidence, Outline};
 
 use freerange_splat::Cloud;
 

@@ -96,15 +96,15 @@ const FITTED: usize = 3;
 
 /// How many steps [`find_mirror`] tells of.
 pub fn mirror_steps(config: &QuickFitConfig) -> usize {
-    config.iterations + FITTED * (config.iterations + ROUNDS * going_on(config).iterations)
+    FITTED * (config.iterations + ROUNDS * going_on(config).iterations)
 }
 
 /// The plane about which an object is its own mirror image, as far as photos of it tell: none where they doubt every plane by more than `most`
 /// (see [`FoundMirror::doubt`]), no plane suits their outlines, or they are all from one side. Of several the one that they doubt least.
-/// `views` lie in the canonical frame.
+/// `views` lie in the canonical frame; `own` is a [`quick_fit`](crate::quick_fit) of them.
 ///
 /// Three questions, each asked of fewer planes than the one before. Can what lies within all outlines and within all mirrored ones fill the outlines?
-/// (All directions, fifteen degrees apart, but for those from which mirrored photos share nothing with the photos.) From behind which of these planes does a quick fit of the photos look most like them? And how much do photos
+/// (All directions, fifteen degrees apart, but for those from which mirrored photos share nothing with the photos.) From behind which of these planes does that fit of the photos look most like them? And how much do photos
 /// and mirrored photos contradict each other, in a fit of both that moves the plane as well?
 /// `progress` hears how many of [`mirror_steps`] are done, of some more than once, and ends the search, with none, by `ControlFlow::Break`.
 ///
@@ -112,6 +112,7 @@ pub fn mirror_steps(config: &QuickFitConfig) -> usize {
 /// Those of [`fit`](crate::fit()).
 pub fn find_mirror(
     views: &[View],
+    own: &Cloud,
     config: &QuickFitConfig,
     most: f64,
     seed: u64,
@@ -122,15 +123,14 @@ pub fn find_mirror(
     let planes = planes(&Hull::new(&outlines), &outlines);
     let pictures = Targets::new(views, Some(PICTURE))?;
     let mut search = Search { progress: &mut progress, seed, done: 0 };
-    let Some(own) = search.fitted(None, views, config)? else { return Ok(None) };
     let put = |cloud: &Cloud, plane: Mirror, reach| {
         place(plane, [reach, 0.001], |plane| difference(cloud, &pictures, Some(plane), true))
     };
-    let judge = |plane: Mirror| Ok((difference(&own, &pictures, Some(&plane), true)?, plane));
+    let judge = |plane: Mirror| Ok((difference(own, &pictures, Some(&plane), true)?, plane));
     let Some(judged) = search.each(planes, judge)? else { return Ok(None) };
     let judged: Vec<Mirror> = best(judged, PLACED).into_iter().map(|(_, plane)| plane).collect();
-    let Some(placed) = search.each(judged, |plane| put(&own, plane, 0.04))? else { return Ok(None) };
-    let before = difference::<Mirror>(&own, &pictures, None, true)?;
+    let Some(placed) = search.each(judged, |plane| put(own, plane, 0.04))? else { return Ok(None) };
+    let before = difference::<Mirror>(own, &pictures, None, true)?;
     let mut found: Option<FoundMirror> = None;
     for (_, mut plane) in best(placed, FITTED) {
         let both = |plane: &Mirror| [views, &mirrored(views, plane)[..]].concat();
@@ -202,7 +202,7 @@ mod tests {
     use std::f64::consts::PI;
 
     use super::*;
-    use crate::tests::{ball, cameras, photograph};
+    use crate::tests::{ball, cameras, own, photograph};
     use freerange_splat::channel;
 
     /// Round Gaussians, so that turning them is no matter.
@@ -260,7 +260,11 @@ mod tests {
     fn what_is_its_own_mirror_image_is_told_from_what_is_not() {
         let config = QuickFitConfig { iterations: 120, gaussians: 150, render_size: 64 };
         let find = |cloud: &Cloud| {
-            find_mirror(&photos(cloud), &config, f64::INFINITY, 0, |_| ControlFlow::Continue(())).unwrap().unwrap()
+            find_mirror(&photos(cloud), &own(&photos(cloud), &config), &config, f64::INFINITY, 0, |_| {
+                ControlFlow::Continue(())
+            })
+            .unwrap()
+            .unwrap()
         };
         let found = find(&twins(20, 3, &MIRROR));
         let (normal, side) = (found.mirror.normal, found.mirror.normal.dot(MIRROR.normal).signum());
@@ -269,7 +273,8 @@ mod tests {
         let other = find(&round(40, 7));
         assert!(other.doubt > found.doubt + 0.3, "{other:?} {found:?}");
         let most = other.doubt - 0.01;
-        let none = find_mirror(&photos(&round(40, 7)), &config, most, 0, |_| ControlFlow::Continue(()));
+        let views = photos(&round(40, 7));
+        let none = find_mirror(&views, &own(&views, &config), &config, most, 0, |_| ControlFlow::Continue(()));
         assert!(none.unwrap().is_none_or(|found| found.doubt <= most));
     }
 
@@ -293,7 +298,8 @@ mod tests {
         let config = QuickFitConfig { iterations: 7, gaussians: 30, render_size: 32 };
         let views = photos(&twins(10, 3, &MIRROR));
         let mut told = Vec::new();
-        find_mirror(&views, &config, f64::INFINITY, 0, |done| {
+        let own = own(&views, &config);
+        find_mirror(&views, &own, &config, f64::INFINITY, 0, |done| {
             told.push(done);
             ControlFlow::Continue(())
         })
@@ -301,15 +307,15 @@ mod tests {
         assert!(told.len() > told.iter().max().map_or(0, |&last| last), "planes are told of, too");
         assert!(told.windows(2).all(|pair| pair[0] <= pair[1]), "{told:?}");
         told.dedup();
-        assert!(told.iter().copied().eq(1..=told.len()) && told.len() <= mirror_steps(&config), "{told:?}");
-        for last in [1, 9, 16] {
+        assert!(told.iter().copied().eq(0..told.len()) && told.len() <= mirror_steps(&config) + 1, "{told:?}");
+        for last in [0, 1, 9, 16] {
             let mut reached = 0;
-            let found = find_mirror(&views, &config, f64::INFINITY, 0, |done| {
+            let found = find_mirror(&views, &own, &config, f64::INFINITY, 0, |done| {
                 reached = done;
                 if done == last { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
             });
             assert!(found.unwrap().is_none() && reached == last, "{last}: {reached}");
         }
-        assert!(find_mirror(&[], &config, f64::INFINITY, 0, |_| ControlFlow::Continue(())).is_err());
+        assert!(find_mirror(&[], &own, &config, f64::INFINITY, 0, |_| ControlFlow::Continue(())).is_err());
     }
 }

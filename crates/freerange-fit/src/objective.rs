@@ -204,7 +204,7 @@ pub(crate) fn normalize_rotations(cloud: &mut Cloud) {
 mod tests {
     use super::*;
     use crate::{
-        Evidence, HoldConfig,
+        Evidence, HoldConfig, Outline,
         hold::Hold,
         tests::{ball, ring},
     };
@@ -270,7 +270,11 @@ mod tests {
     fn gradients_of_outlines_match_finite_differences() {
         let mut views = ring(4, 24, &ball(12, 1));
         views[3] = ring(4, 40, &ball(12, 1)).remove(3);
-        let targets = Targets::new(Evidence { views: &views[..1], outlines: &views[1..] }, Some(32)).unwrap();
+        let targets = Targets::new(
+            Evidence { views: &views[..1], outlines: views[1..].iter().map(Outline::from).collect() },
+            Some(32),
+        )
+        .unwrap();
         let outlines = |cloud: &Cloud, chosen: &[usize]| {
             let mut objective = Objective::none(cloud);
             objective.add_outlines(cloud, &targets, chosen).unwrap();

@@ -13,6 +13,9 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use std::ops::ControlFlow;
 
+/// Longest side, in pixels, of outlines. They come from guesses, which nobody vouches for to the pixel.
+const OUTLINES: u32 = 128;
+
 /// Improves a cloud's agreement with posed views, and shows more detail by more Gaussians.
 ///
 /// Few views say little of the rest of the object, and Gaussians that only they judge leave the object's surface. Hence a
@@ -36,7 +39,9 @@ pub fn refine<'a>(
     config.check()?;
     let seen = seen.into();
     let targets = Targets::new(seen.views, config.render_size)?;
-    let outlines = (!seen.outlines.is_empty()).then(|| Targets::new(seen, config.render_size)).transpose()?;
+    let further = seen.outlines.len();
+    let size = config.render_size.map_or(OUTLINES, |size| size.min(OUTLINES));
+    let outlines = (further > 0).then(|| Targets::new(seen, Some(size))).transpose()?;
     let clouds = std::iter::once(cloud).chain(others).map(|cloud| checked(cloud, usize::MAX));
     let clouds = clouds.collect::<Result<Vec<_>, _>>()?;
     let hold = Hold::new(&clouds, &config.hold)?;
@@ -53,7 +58,7 @@ pub fn refine<'a>(
     let more = |objective: &mut Objective, cloud: &Cloud, background| {
         step += 1;
         if let Some(outlines) = outlines.as_ref().filter(|_| step % 2 == 0) {
-            let chosen = next_views(&mut outline_queue, seen.outlines.len(), 1, &mut hold_rng);
+            let chosen = next_views(&mut outline_queue, further, 1, &mut hold_rng);
             objective.add_outlines(cloud, outlines, &chosen)?;
         }
         let chosen = next_views(&mut queue, hold.views(), 1, &mut hold_rng);

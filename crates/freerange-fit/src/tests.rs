@@ -1,5 +1,6 @@
 //! Fits of small scenes that the rasteriser itself has drawn, and what all tests share.
 
+use crate::views::Targets;
 use crate::*;
 use freerange_camera::{Camera, View};
 use freerange_raster::{RasterConfig, render};
@@ -54,6 +55,36 @@ pub(crate) fn photograph(cloud: &Cloud, camera: &Camera) -> View {
         pixel[3] = (alpha * 255.0).round() as u8;
     }
     View { name: "view".into(), camera: *camera, image }
+}
+
+/// Many outlines may share one picture, which is shrunk once.
+#[test]
+fn outlines_share_pictures() {
+    let mut views = ring(2, 24, &ball(12, 1));
+    views[1] = ring(2, 40, &ball(12, 1)).remove(1);
+    let from = cameras(3, 24, 1.0);
+    let outlines = from.iter().zip([1, 0, 1]).map(|(camera, of)| {
+        let (width, height) = views[of].image.dimensions();
+        Outline { camera: camera.resized(width, height), ..Outline::from(&views[of]) }
+    });
+    let targets = Targets::new(Evidence { views: &views, outlines: outlines.collect() }, Some(32)).unwrap();
+    assert_eq!((targets.views, targets.cameras.len()), (2, 5));
+    for (i, (of, size)) in [(0, 24), (1, 32), (1, 32), (0, 24), (1, 32)].into_iter().enumerate() {
+        let expected = freerange_camera::image_ops::resize_area(&views[of].image, size, size);
+        assert_eq!(targets.images[i], expected, "{i}");
+        let camera = if i < 2 { views[of].camera } else { from[i - 2] };
+        assert!(targets.cameras[i].world_to_camera == camera.world_to_camera, "{i}");
+        let found = &targets.cameras[i];
+        assert!(found.width == size && (found.fx - camera.resized(size, size).fx).abs() < 1e-9, "{i}: {found:?}");
+    }
+    let wrong = Outline { camera: from[0], ..Outline::from(&views[1]) };
+    let refused = Targets::new(Evidence { views: &views[..1], outlines: vec![wrong] }, None).err().unwrap();
+    assert!(matches!(refused, FitError::View { field: "image", .. }), "{refused}");
+}
+
+/// What searches for symmetries begin with.
+pub(crate) fn own(views: &[View], config: &QuickFitConfig) -> Cloud {
+    quick_fit(views, config, 0, go).unwrap()
 }
 
 /// Views of the cloud from all around.
@@ -155,15 +186,20 @@ fn polishing_keeps_the_number_and_comes_nearer() {
 }
 
 /// A cloud as a generator might give it: right on the whole, wrong in detail.
+fn evidence<'a>(views: &'a [View], outlines: &'a [View]) -> Evidence<'a> {
+    Evidence { views, outlines: outlines.iter().map(Outline::from).collect() }
+}
+
 /// Outlines from further places mend the shape, and tell no colours.
 #[test]
 fn outlines_are_fitted_to() {
     let scene = ball(40, 12);
     let photos: Vec<View> = cameras(3, 32, 0.2).iter().map(|c| photograph(&scene, c)).collect();
-    let mut outlines = ring(12, 32, &scene);
+    let outlines = ring(12, 32, &scene);
     let config = FitConfig { iterations: 300, cap_max: 100, ..small() };
+    let seen = |outlines| evidence(&photos, outlines);
     let alone = fit(&photos, None, &config, go).unwrap();
-    let helped = fit(Evidence { views: &photos, outlines: &outlines }, None, &config, go).unwrap();
+    let helped = fit(seen(&outlines), None, &config, go).unwrap();
     let apart = |cloud: &Cloud| {
         let views = cameras(5, 32, 1.0).into_iter().map(|c| (photograph(&scene, &c), photograph(cloud, &c)));
         let each = views.map(|(a, b)| {
@@ -174,16 +210,14 @@ fn outlines_are_fitted_to() {
     };
     assert!(apart(&helped) < 0.7 * apart(&alone), "{} {}", apart(&helped), apart(&alone));
     let config_of_refinement = RefineConfig { steps: 200, gaussians: 100, ..RefineConfig::default() };
-    let [plain, outlined] = [&[][..], &outlines].map(|outlines| {
-        let seen = Evidence { views: &photos, outlines };
-        refine(&alone, &[], seen, &config_of_refinement, go).unwrap()
-    });
+    let [plain, outlined] =
+        [&[][..], &outlines].map(|outlines| refine(&alone, &[], seen(outlines), &config_of_refinement, go).unwrap());
     assert!(apart(&outlined) < 0.8 * apart(&plain), "{} {}", apart(&outlined), apart(&plain));
-    outlines.iter_mut().for_each(|view| view.image.pixels_mut().for_each(|p| p.0 = [9, 99, 199, p[3]]));
-    let other = fit(Evidence { views: &photos, outlines: &outlines }, None, &config, go).unwrap();
+    let mut grey = outlines.clone();
+    grey.iter_mut().for_each(|view| view.image.pixels_mut().for_each(|p| p.0 = [9, 99, 199, p[3]]));
+    let other = fit(seen(&grey), None, &config, go).unwrap();
     assert_eq!(other, helped);
-    let none = Evidence { views: &[], outlines: &outlines };
-    assert!(matches!(fit(none, None, &config, go), Err(FitError::NoViews)));
+    assert!(matches!(fit(evidence(&[], &outlines), None, &config, go), Err(FitError::NoViews)));
 }
 
 fn disturbed(cloud: &Cloud, seed: u64) -> Cloud {

@@ -8,17 +8,34 @@ use image::RgbaImage;
 use rayon::prelude::*;
 
 /// What a fit is to agree with. Views alone are one, too.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub struct Evidence<'a> {
     /// Posed views.
     pub views: &'a [View],
-    /// More of them, of which the outline alone is looked at: their alpha.
-    pub outlines: &'a [View],
+    /// Outlines from further places.
+    pub outlines: Vec<Outline<'a>>,
+}
+
+/// What a picture tells of an object's shape, and of that alone: its alpha. Many may share one picture.
+#[derive(Clone, Copy, Debug)]
+pub struct Outline<'a> {
+    /// Of the view that it comes from, for messages.
+    pub name: &'a str,
+    /// From where it is seen.
+    pub camera: Camera,
+    /// The picture.
+    pub image: &'a RgbaImage,
+}
+
+impl<'a> From<&'a View> for Outline<'a> {
+    fn from(view: &'a View) -> Self {
+        Self { name: &view.name, camera: view.camera, image: &view.image }
+    }
 }
 
 impl<'a> From<&'a [View]> for Evidence<'a> {
     fn from(views: &'a [View]) -> Self {
-        Self { views, outlines: &[] }
+        Self { views, outlines: Vec::new() }
     }
 }
 
@@ -43,11 +60,11 @@ pub(crate) struct Targets {
     rasters: Vec<RasterConfig>,
 }
 
-fn refuse<T>(view: &View, field: &'static str, expected: String, found: String) -> Result<T, FitError> {
-    Err(FitError::View { name: view.name.clone(), field, expected, found })
+fn refuse<T>(view: &Outline<'_>, field: &'static str, expected: String, found: String) -> Result<T, FitError> {
+    Err(FitError::View { name: view.name.to_owned(), field, expected, found })
 }
 
-fn check(view: &View) -> Result<(), FitError> {
+fn check(view: &Outline<'_>) -> Result<(), FitError> {
     let c = &view.camera;
     let (width, height) = view.image.dimensions();
     if (width, height) != (c.width, c.height) {
@@ -79,21 +96,36 @@ impl Targets {
         if seen.views.is_empty() {
             return Err(FitError::NoViews);
         }
-        let views: Vec<&View> = seen.views.iter().chain(seen.outlines).collect();
-        views.iter().try_for_each(|view| check(view))?;
-        let sizes: Vec<(u32, u32)> = views
+        let all: Vec<Outline<'_>> = seen.views.iter().map(Outline::from).chain(seen.outlines).collect();
+        all.iter().try_for_each(check)?;
+        // Each picture once, however many share it.
+        let mut pictures: Vec<&RgbaImage> = Vec::new();
+        let of: Vec<usize> = all
             .iter()
-            .map(|v| size.map_or(v.image.dimensions(), |size| image_ops::shrunk_size(v.image.dimensions(), size)))
+            .map(|one| {
+                pictures.iter().position(|known| std::ptr::eq(*known, one.image)).unwrap_or_else(|| {
+                    pictures.push(one.image);
+                    pictures.len() - 1
+                })
+            })
             .collect();
-        let sized = || views.par_iter().copied().zip(&sizes);
-        let longest = |(w, h): (u32, u32)| w.max(h) as f32;
-        let raster =
-            |(v, &small): (&View, _)| RasterConfig::default().shrunk(longest(small) / longest(v.image.dimensions()));
+        let small = |image: &RgbaImage| {
+            let full = image.dimensions();
+            let (w, h) = size.map_or(full, |size| image_ops::shrunk_size(full, size));
+            let longest = |(w, h): (u32, u32)| w.max(h) as f32;
+            let raster = RasterConfig::default().shrunk(longest((w, h)) / longest(full));
+            (image_ops::resize_area(image, w, h), raster)
+        };
+        let (pictures, rasters): (Vec<RgbaImage>, Vec<RasterConfig>) = pictures.into_par_iter().map(small).unzip();
+        let cameras = all.iter().zip(&of).map(|(one, &of)| {
+            let (w, h) = pictures[of].dimensions();
+            one.camera.resized(w, h)
+        });
         Ok(Self {
-            cameras: sized().map(|(v, &(w, h))| v.camera.resized(w, h)).collect(),
-            images: sized().map(|(v, &(w, h))| image_ops::resize_area(&v.image, w, h)).collect(),
+            cameras: cameras.collect(),
+            images: of.iter().map(|&of| pictures[of].clone()).collect(),
             views: seen.views.len(),
-            rasters: sized().map(raster).collect(),
+            rasters: of.iter().map(|&of| rasters[of]).collect(),
         })
     }
 

@@ -4,8 +4,8 @@ use std::ops::ControlFlow;
 
 use freerange_camera::{CanonicalFrame, FrameConfig, Similarity, View};
 use freerange_fit::{
-    Evidence, FitProgress, FoundAxis, FoundMirror, QuickFitConfig, axis_steps, find_axis, find_mirror, frame_of,
-    mirror_steps, mirrored, quick_fit, turned,
+    Axis, Evidence, FitProgress, FoundAxis, FoundMirror, Outline, QuickFitConfig, axis_steps, find_axis, find_mirror,
+    frame_of, mirror_steps, mirrored, quick_fit, turned,
 };
 use freerange_flow::sample::SampleConfig;
 use freerange_splat::Cloud;
@@ -25,9 +25,10 @@ pub(crate) struct Placed {
     pub chosen: Vec<usize>,
     /// These, in the canonical frame, and what is added to them.
     pub shown: Vec<View>,
-    /// Outlines that are known of the object besides, of the views that the model is shown and of all.
-    shown_outlines: Vec<View>,
-    canonical_outlines: Vec<View>,
+    /// About which its outlines may be turned.
+    axis: Option<Axis>,
+    /// How many views there were, before anything was added to them.
+    photos: usize,
     /// Whether they are where they are to stay.
     pub settled: bool,
 }
@@ -51,15 +52,7 @@ impl Placed {
                 .push(format!("{uneven} of {all} views are not square: the model is shown squares, cut or padded"));
         }
         let settled = frame.kept;
-        Ok(Self {
-            frame,
-            canonical,
-            chosen,
-            shown,
-            shown_outlines: Vec::new(),
-            canonical_outlines: Vec::new(),
-            settled,
-        })
+        Ok(Self { frame, canonical, chosen, shown, axis: None, photos: views.len(), settled })
     }
 
     /// Looks for what leaves the object as it is, and adds what that shows of it: mirrored photos as further views, turned outlines as further
@@ -73,35 +66,33 @@ impl Placed {
             return Ok(());
         }
         let config = &sample.start.as_ref().map_or_else(QuickFitConfig::default, |start| start.fit.clone());
-        let framing = if self.settled { 0 } else { config.iterations };
         let turning = if sample.turn > 0.0 { axis_steps(config) } else { 0 };
         let mirroring = if sample.mirror > 0.0 { mirror_steps(config) } else { 0 };
-        let total = framing + turning + mirroring;
+        let total = config.iterations + turning + mirroring;
         tell(&Progress::new(Stage::Mirror, 0, total))?;
         let mut stopped = Ok(());
         let mut told = |done, stopped: &mut Result<(), Error>| {
             *stopped = tell(&Progress::new(Stage::Mirror, done, total));
             if stopped.is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
         };
+        let mut own = quick_fit(&self.shown, config, 0, |p| told(p.step, &mut stopped))?;
+        stopped?;
+        stopped = Ok(());
         if !self.settled {
-            let moved = quick_fit(&self.shown, config, 0, |p| told(p.step, &mut stopped))?;
-            stopped?;
-            stopped = Ok(());
-            let correction = frame_of(&moved, &self.shown)?;
-            self.correct(&correction);
+            self.follow(&mut own)?;
         }
         let mut axis = None;
         if turning > 0 {
             let most = sample.turn.into();
-            axis = find_axis(&self.shown, config, most, 0, |done| told(framing + done, &mut stopped))?;
+            axis = find_axis(&self.shown, &own, config, most, 0, |done| told(config.iterations + done, &mut stopped))?;
             stopped?;
             stopped = Ok(());
         }
         let mut mirror = None;
         if mirroring > 0 {
             let most = sample.mirror.into();
-            let tell = |done| told(framing + turning + done, &mut stopped);
-            mirror = find_mirror(&self.shown, config, most, 0, tell)?;
+            let tell = |done| told(config.iterations + turning + done, &mut stopped);
+            mirror = find_mirror(&self.shown, &own, config, most, 0, tell)?;
             stopped?;
         }
         tell(&Progress::new(Stage::Mirror, total, total))?;
@@ -112,8 +103,7 @@ impl Placed {
                 "the object is taken to keep its outlines however it is turned about an axis in direction ({x:.2}, {y:.2}, {z:.2}): turned \
                  outlines are fitted to (contradiction {contradiction:.2}, at most {most})"
             ));
-            self.shown_outlines = turned(&self.shown, &axis);
-            self.canonical_outlines = turned(&self.canonical, &axis);
+            self.axis = Some(axis);
         }
         if let Some(FoundMirror { mirror, doubt }) = mirror {
             let [x, y, z] = mirror.normal.to_array();
@@ -130,12 +120,16 @@ impl Placed {
 
     /// What fits of what the model is shown agree with.
     pub fn seen(&self) -> Evidence<'_> {
-        Evidence { views: &self.shown, outlines: &self.shown_outlines }
+        Evidence { views: &self.shown, outlines: self.outlines(&self.shown[..self.chosen.len()]) }
     }
 
     /// What a fit of all views agrees with.
     pub fn all(&self) -> Evidence<'_> {
-        Evidence { views: &self.canonical, outlines: &self.canonical_outlines }
+        Evidence { views: &self.canonical, outlines: self.outlines(&self.canonical[..self.photos]) }
+    }
+
+    fn outlines<'a>(&self, photos: &'a [View]) -> Vec<Outline<'a>> {
+        self.axis.as_ref().map_or_else(Vec::new, |axis| turned(photos, axis))
     }
 
     /// A quick fit for each member of the ensemble of each seed, `[members][seeds]`. The first of seed 0 moves frame and views, of
@@ -163,9 +157,7 @@ impl Placed {
         let mut first = None;
         if !self.settled {
             let mut moved = fit(self.seen(), Some(&self.frame.canonical_from_user), 0)?;
-            let correction = frame_of(&moved, &self.shown)?;
-            moved.transform(correction.scale, correction.rotation, correction.translation);
-            self.correct(&correction);
+            self.follow(&mut moved)?;
             first = Some(moved);
         }
         let mut made = |number| match &first {
@@ -175,15 +167,17 @@ impl Placed {
         numbers.into_iter().map(|seeds| seeds.into_iter().map(&mut made).collect()).collect()
     }
 
-    fn correct(&mut self, correction: &Similarity) {
+    /// Moves frame and views, and the fit itself, to where a quick fit says that the object is.
+    fn follow(&mut self, fit: &mut Cloud) -> Result<(), Error> {
+        let correction = &frame_of(fit, &self.shown)?;
+        fit.transform(correction.scale, correction.rotation, correction.translation);
         self.canonical = moved(&self.canonical, correction);
         self.shown = moved(&self.shown, correction);
-        self.shown_outlines = moved(&self.shown_outlines, correction);
-        self.canonical_outlines = moved(&self.canonical_outlines, correction);
         self.frame.canonical_from_user = correction.after(&self.frame.canonical_from_user);
         self.settled = true;
         let (shift, scale) = (correction.translation.length(), correction.scale);
         self.frame.notes.push(format!("the quick fit moved it by {shift:.3} and scaled it by {scale:.3}"));
+        Ok(())
     }
 }
 

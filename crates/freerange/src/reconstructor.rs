@@ -231,7 +231,9 @@ impl Reconstructor {
             let quick = QuickFitConfig { iterations: config.polishing(), ..QuickFitConfig::default() };
             for (cloud, &seed) in clouds.iter_mut().zip(&seeds) {
                 let done = [steps.done, steps.total];
-                *cloud = watched(Stage::Sample, 0, None, steps.tell, done, |p| polish(cloud, seen, &quick, seed, p))?;
+                *cloud = watched(Stage::Sample, 0, None, steps.tell, done, |p| {
+                    polish(cloud, seen.clone(), &quick, seed, p)
+                })?;
                 steps.done += quick.iterations;
             }
         }
