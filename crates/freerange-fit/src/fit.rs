@@ -36,16 +36,16 @@ pub fn fit<'a>(
         Some(cloud) => checked(cloud, config.cap_max)?,
         None => random_cloud(&targets, config, &mut rng),
     };
-    optimise(cloud, &targets, config, &mut rng, |_, _, _| Ok(()), progress)
+    optimise(cloud, &targets, config, &mut rng, |_, _| Ok(Vec::new()), progress)
 }
 
-/// The optimisation itself. `more` adds further terms to the objective of a cloud over a background.
+/// The optimisation itself. `more` are further terms of the objective of a cloud over a background.
 pub(crate) fn optimise(
     mut cloud: Cloud,
     targets: &Targets,
     config: &FitConfig,
     rng: &mut ChaCha8Rng,
-    mut more: impl FnMut(&mut Objective, &Cloud, [f32; 3]) -> Result<(), FitError>,
+    mut more: impl FnMut(&Cloud, [f32; 3]) -> Result<Vec<Objective>, FitError> + Send,
     mut progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Cloud, FitError> {
     let mut adam = Adam::default();
@@ -55,34 +55,37 @@ pub(crate) fn optimise(
         let done = step as f64 / config.iterations as f64;
         let mean_rate = config.rates.mean * (config.final_mean_rate / config.rates.mean).powf(done);
 
-        // Every other step looks at outlines alone, if there are any.
-        let outlined = outlines > 0 && step % 2 == 1;
-        let chosen = match outlined {
-            true => next_views(&mut outline_queue, outlines, config.views_per_step, rng),
-            false => next_views(&mut queue, targets.views, config.views_per_step, rng),
-        };
-        let background = config.background.draw(rng);
-        let mut objective = match outlined {
-            true => Objective::none(&cloud),
-            false => Objective::photometric(&cloud, targets, &chosen, background, config.lambda_ssim)?,
-        };
-        if outlined {
-            objective.add_outlines(&cloud, targets, &chosen)?;
-        }
-        let loss = objective.loss;
-        more(&mut objective, &cloud, background)?;
-        objective.add_opacity(&cloud, config.opacity_regularizer);
-        objective.add_scale(&cloud, config.scale_regularizer);
-        objective.check(step)?;
-        adam.step(cloud.rows_mut(), &objective.gradients, &config.rates.by_channel(mean_rate));
-        normalize_rotations(&mut cloud);
+        // Within the pool: from outside, each of the many small pieces of a step would wait for a thread to wake.
+        let loss = rayon::scope(|_| {
+            // Every other step looks at outlines alone, if there are any.
+            let outlined = outlines > 0 && step % 2 == 1;
+            let chosen = match outlined {
+                true => next_views(&mut outline_queue, outlines, config.views_per_step, rng),
+                false => next_views(&mut queue, targets.views, config.views_per_step, rng),
+            };
+            let background = config.background.draw(rng);
+            let own = || match outlined {
+                true => Objective::outlines(&cloud, targets, &chosen),
+                false => Objective::photometric(&cloud, targets, &chosen, background, config.lambda_ssim),
+            };
+            let (own, further) = rayon::join(own, || more(&cloud, background));
+            let mut objective = own?;
+            let loss = objective.loss;
+            further?.iter().for_each(|other| objective.add(other));
+            objective.add_opacity(&cloud, config.opacity_regularizer);
+            objective.add_scale(&cloud, config.scale_regularizer);
+            objective.check(step)?;
+            adam.step(cloud.rows_mut(), &objective.gradients, &config.rates.by_channel(mean_rate));
+            normalize_rotations(&mut cloud);
 
-        let due = step >= config.growth_start && step % config.refine_every == 0;
-        if due && done < config.growth_stop {
-            relocate_and_grow(&mut cloud, &mut adam, config, rng);
-        }
-        add_noise(&mut cloud, config.noise_lr * mean_rate, config.dead_opacity, rng);
-        check_cloud(&cloud, step)?;
+            let due = step >= config.growth_start && step % config.refine_every == 0;
+            if due && done < config.growth_stop {
+                relocate_and_grow(&mut cloud, &mut adam, config, rng);
+            }
+            add_noise(&mut cloud, config.noise_lr * mean_rate, config.dead_opacity, rng);
+            check_cloud(&cloud, step)?;
+            Ok::<_, FitError>(loss)
+        })?;
 
         let (step, steps, gaussians) = (step + 1, config.iterations, cloud.len());
         if progress(&FitProgress { step, steps, loss, gaussians, cloud: &cloud }).is_break() {

@@ -68,28 +68,21 @@ impl Hold {
         self.pictures.len()
     }
 
-    /// Adds the mean absolute difference between picture `view` and `cloud`, both over `background`, times the weight.
-    pub fn add(
-        &self,
-        objective: &mut Objective,
-        cloud: &Cloud,
-        view: usize,
-        background: [f32; 3],
-    ) -> Result<(), FitError> {
+    /// The mean absolute difference between picture `view` and `cloud`, both over `background`, times the weight.
+    pub fn objective(&self, cloud: &Cloud, view: usize, background: [f32; 3]) -> Result<Objective, FitError> {
         let Picture { camera, rgb, alpha } = &self.pictures[view];
         let out = render(cloud.rows(), &[*camera], &[background], &self.raster)?;
         let share = (self.weight / out.rgb.len() as f64) as f32;
-        let mut d_rgb = vec![0.0; out.rgb.len()];
+        let (mut loss, mut d_rgb) = (0.0, vec![0.0; out.rgb.len()]);
         let pixels = out.rgb.as_chunks::<3>().0.iter().zip(rgb.as_chunks::<3>().0).zip(alpha);
         for (d, ((found, held), alpha)) in d_rgb.as_chunks_mut::<3>().0.iter_mut().zip(pixels) {
             for c in 0..3 {
                 let difference = found[c] - (held[c] + (1.0 - alpha) * background[c]);
-                objective.loss += f64::from(share * difference.abs());
+                loss += f64::from(share * difference.abs());
                 d[c] = if difference.abs() < EQUAL { 0.0 } else { share.copysign(difference) };
             }
         }
         let gradients = render_backward(cloud.rows(), &out, &d_rgb, &[], &[])?.gaussians;
-        objective.gradients.iter_mut().zip(gradients).for_each(|(sum, g)| *sum += g);
-        Ok(())
+        Ok(Objective { loss, gradients })
     }
 }

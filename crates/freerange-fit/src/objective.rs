@@ -47,13 +47,9 @@ impl Objective {
         Ok(Self { loss, gradients })
     }
 
-    /// Nothing that there would be to learn.
-    pub fn none(cloud: &Cloud) -> Self {
-        Self { loss: 0.0, gradients: vec![0.0; cloud.rows().len()] }
-    }
-
-    /// Adds the mean over the `chosen` outlines, counted from the first of them, of the absolute difference of alpha.
-    pub fn add_outlines(&mut self, cloud: &Cloud, targets: &Targets, chosen: &[usize]) -> Result<(), FitError> {
+    /// Mean over the `chosen` outlines, counted from the first of them, of the absolute difference of alpha.
+    pub fn outlines(cloud: &Cloud, targets: &Targets, chosen: &[usize]) -> Result<Self, FitError> {
+        let mut sum = Self { loss: 0.0, gradients: vec![0.0; cloud.rows().len()] };
         let chosen: Vec<usize> = chosen.iter().map(|&i| targets.views + i).collect();
         for (group, raster) in targets.groups(&chosen) {
             let cameras: Vec<_> = group.iter().map(|&i| targets.cameras[i]).collect();
@@ -64,14 +60,20 @@ impl Objective {
             let pixels = group.iter().flat_map(|&i| targets.images[i].pixels());
             for ((d, alpha), pixel) in d_alpha.iter_mut().zip(&output.alpha).zip(pixels) {
                 let difference = alpha - f32::from(pixel[3]) / 255.0;
-                self.loss += f64::from(share * difference.abs());
+                sum.loss += f64::from(share * difference.abs());
                 *d = if difference == 0.0 { 0.0 } else { share.copysign(difference) };
             }
             let d_rgb = vec![0.0; output.rgb.len()];
             let gradients = render_backward(cloud.rows(), &output, &d_rgb, &d_alpha, &[])?.gaussians;
-            self.gradients.iter_mut().zip(gradients).for_each(|(sum, g)| *sum += g);
+            sum.gradients.iter_mut().zip(gradients).for_each(|(sum, g)| *sum += g);
         }
-        Ok(())
+        Ok(sum)
+    }
+
+    /// Adds another one, of the same cloud.
+    pub fn add(&mut self, other: &Self) {
+        self.loss += other.loss;
+        self.gradients.iter_mut().zip(&other.gradients).for_each(|(sum, g)| *sum += g);
     }
 
     /// Adds `weight` times the mean opacity.
@@ -260,7 +262,7 @@ mod tests {
             let mut o = Objective::photometric(cloud, &targets, &[0, 2], [0.3, 0.6, 0.1], 0.2).unwrap();
             o.add_opacity(cloud, 0.3);
             o.add_scale(cloud, 0.7);
-            hold.add(&mut o, cloud, 1, [0.3, 0.6, 0.1]).unwrap();
+            o.add(&hold.objective(cloud, 1, [0.3, 0.6, 0.1]).unwrap());
             o
         };
         check_gradient(value);
@@ -275,11 +277,7 @@ mod tests {
             Some(32),
         )
         .unwrap();
-        let outlines = |cloud: &Cloud, chosen: &[usize]| {
-            let mut objective = Objective::none(cloud);
-            objective.add_outlines(cloud, &targets, chosen).unwrap();
-            objective
-        };
+        let outlines = |cloud: &Cloud, chosen: &[usize]| Objective::outlines(cloud, &targets, chosen).unwrap();
         check_gradient(|cloud| outlines(cloud, &[0, 2]));
         // Colours are no part of them.
         let mut grey = ball(12, 3);

@@ -55,14 +55,16 @@ pub fn refine<'a>(
     let mut queue = Vec::new();
     // Photos have more to tell here than shape: outlines come beside them, at every other step.
     let (mut outline_queue, mut step) = (Vec::new(), 0);
-    let more = |objective: &mut Objective, cloud: &Cloud, background| {
+    let more = |cloud: &Cloud, background| {
         step += 1;
-        if let Some(outlines) = outlines.as_ref().filter(|_| step % 2 == 0) {
-            let chosen = next_views(&mut outline_queue, further, 1, &mut hold_rng);
-            objective.add_outlines(cloud, outlines, &chosen)?;
-        }
-        let chosen = next_views(&mut queue, hold.views(), 1, &mut hold_rng);
-        chosen.into_iter().try_for_each(|view| hold.add(objective, cloud, view, background))
+        let outlined = outlines.as_ref().filter(|_| step % 2 == 0);
+        let outlined = outlined.map(|targets| (targets, next_views(&mut outline_queue, further, 1, &mut hold_rng)));
+        let held = next_views(&mut queue, hold.views(), 1, &mut hold_rng);
+        let (outlined, held) = rayon::join(
+            || outlined.map(|(targets, chosen)| Objective::outlines(cloud, targets, &chosen)).transpose(),
+            || held.first().map(|&view| hold.objective(cloud, view, background)).transpose(),
+        );
+        Ok(outlined?.into_iter().chain(held?).collect())
     };
     optimise(start, &targets, &fit, &mut rng, more, progress)
 }
