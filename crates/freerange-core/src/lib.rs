@@ -1,5 +1,5 @@
 //! What many crates need and none of them owns: errors that name the field or the file, files that are whole or not
-//! there, hashes, shares of work, what lies behind an object, and small operations on pictures.
+//! there, hashes, shares of work, work side by side, what lies behind an object, and small operations on pictures.
 
 mod background;
 mod error;
@@ -7,9 +7,11 @@ mod file;
 mod hash;
 pub mod image_ops;
 mod share;
+mod side_by_side;
 
 pub use background::Background;
 pub use error::{Invalid, IoError, check};
 pub use file::{beside, persist, sync_folder, sync_tree, write_atomically};
 pub use hash::{hex, sha256, sha256_of};
 pub use share::Share;
+pub use side_by_side::side_by_side;

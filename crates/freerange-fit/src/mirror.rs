@@ -3,6 +3,7 @@
 use std::ops::ControlFlow;
 
 use freerange_camera::{Camera, View};
+use freerange_core::side_by_side;
 use freerange_splat::Cloud;
 use glam::{DMat3, DMat4, DVec3};
 use image::imageops::flip_horizontal;
@@ -131,9 +132,9 @@ pub fn find_mirror(
     let judged: Vec<Mirror> = best(judged, PLACED).into_iter().map(|(_, plane)| plane).collect();
     let Some(placed) = search.each(judged, |plane| put(own, plane, 0.04))? else { return Ok(None) };
     let before = difference::<Mirror>(own, &pictures, None, true)?;
-    let mut found: Option<FoundMirror> = None;
-    for (_, mut plane) in best(placed, FITTED) {
+    let fitted = |mut plane: Mirror, tell: &mut dyn FnMut(()) -> ControlFlow<()>| {
         let both = |plane: &Mirror| [views, &mirrored(views, plane)[..]].concat();
+        let mut search = Search { progress: &mut |_| tell(()), seed, done: 0 };
         let Some(mut cloud) = search.fitted(None, &both(&plane), config)? else { return Ok(None) };
         for _ in 0..ROUNDS {
             (_, plane) = put(&cloud, plane, 0.01)?;
@@ -142,11 +143,26 @@ pub fn find_mirror(
         }
         let contradiction = difference::<Mirror>(&cloud, &pictures, None, true)? / before.max(f64::MIN_POSITIVE);
         let doubt = contradiction - NEW * (1.0 - beside(&pictures, plane.normal));
-        if doubt <= found.map_or(most, |found| found.doubt) {
-            found = Some(FoundMirror { mirror: plane, doubt });
+        Ok::<_, FitError>(Some(FoundMirror { mirror: plane, doubt }))
+    };
+    let fitted = &fitted;
+    let jobs = best(placed, FITTED)
+        .into_iter()
+        .map(|(_, plane)| move |tell: &mut dyn FnMut(()) -> ControlFlow<()>| fitted(plane, tell))
+        .collect();
+    let fitted = side_by_side(jobs, |_, ()| {
+        search.done += 1;
+        (search.progress)(search.done)
+    });
+    let mut least: Option<FoundMirror> = None;
+    for found in fitted {
+        // None where the search was ended.
+        let Some(found) = found? else { return Ok(None) };
+        if found.doubt <= least.map_or(most, |least| least.doubt) {
+            least = Some(found);
         }
     }
-    Ok(found)
+    Ok(least)
 }
 
 /// At most `most` of the planes, those of the smallest values, no two of which are one.

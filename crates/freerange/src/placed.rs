@@ -3,6 +3,7 @@
 use std::ops::ControlFlow;
 
 use freerange_camera::{CanonicalFrame, FrameConfig, Similarity, View};
+use freerange_core::side_by_side;
 use freerange_fit::{
     Axis, Evidence, FitProgress, FoundAxis, FoundMirror, Outline, QuickFitConfig, axis_steps, find_axis, find_mirror,
     frame_of, mirror_steps, mirrored, quick_fit, turned,
@@ -142,29 +143,40 @@ impl Placed {
         tell: &mut impl FnMut(&Progress<'_>) -> Result<(), Error>,
     ) -> Result<Vec<Vec<Cloud>>, Error> {
         let of_members = |member| seeds.iter().map(move |seed| seed.wrapping_mul(MOST_MEMBERS).wrapping_add(member));
-        let numbers: Vec<Vec<u64>> = (0..members as u64).map(|member| of_members(member).collect()).collect();
-        let framing = !self.settled && !numbers.iter().flatten().any(|&number| number == 0);
-        let total = (members * seeds.len() + usize::from(framing)) * config.iterations;
-        let mut done = 0;
-        let mut fit = |seen: Evidence<'_>, place: Option<&Similarity>, number| {
-            // One fit is enough to look at.
-            let place = place.filter(|_| done == 0);
-            let fit = watched(Stage::Fit, 0, place, tell, [done, total], |p| quick_fit(seen, config, number, p))?;
-            done += config.iterations;
-            Ok::<_, Error>(fit)
-        };
+        let numbers: Vec<u64> = (0..members as u64).flat_map(of_members).collect();
+        let framing = !self.settled && !numbers.contains(&0);
+        let total = (numbers.len() + usize::from(framing)) * config.iterations;
         // The fit knows better than the masks where the object is; it moves along, so that one is enough.
         let mut first = None;
         if !self.settled {
-            let mut moved = fit(self.seen(), Some(&self.frame.canonical_from_user), 0)?;
+            let place = &self.frame.canonical_from_user;
+            let mut moved = watched(Stage::Fit, 0, place, tell, total, |p| quick_fit(self.seen(), config, 0, p))?;
             self.follow(&mut moved)?;
             first = Some(moved);
         }
-        let mut made = |number| match &first {
-            Some(first) if number == 0 => Ok(first.clone()),
-            _ => fit(self.seen(), Some(&self.frame.canonical_from_user), number),
-        };
-        numbers.into_iter().map(|seeds| seeds.into_iter().map(&mut made).collect()).collect()
+        let mut done = if first.is_some() { config.iterations } else { 0 };
+        if done == 0 {
+            tell(&Progress::new(Stage::Fit, 0, total))?;
+        }
+        let (seen, first) = (&self.seen(), first.as_ref());
+        let jobs = numbers.iter().enumerate().map(|(i, &number)| {
+            // One fit is enough to look at.
+            let shown = first.is_none() && i == 0;
+            move |tell: &mut dyn FnMut((f64, Option<Cloud>)) -> ControlFlow<()>| match first {
+                Some(first) if number == 0 => Ok(first.clone()),
+                _ => quick_fit(seen.clone(), config, number, |p| tell((p.loss, shown.then(|| p.cloud.clone())))),
+            }
+        });
+        let mut stopped = Ok(());
+        let fits = side_by_side(jobs.collect(), |_, (loss, cloud)| {
+            done += 1;
+            let estimate = cloud.as_ref().map(|cloud| (Known::Fitted(cloud), &self.frame.canonical_from_user));
+            stopped = tell(&Progress { loss: Some(loss), estimate, ..Progress::new(Stage::Fit, done, total) });
+            if stopped.is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+        });
+        stopped?;
+        let fits = fits.into_iter().collect::<Result<Vec<_>, _>>()?;
+        Ok(fits.chunks(seeds.len().max(1)).map(<[Cloud]>::to_vec).collect())
     }
 
     /// Moves frame and views, and the fit itself, to where a quick fit says that the object is.
@@ -187,23 +199,21 @@ const MOST_PHOTOS: usize = 4;
 /// Numbers that the fits of one seed have for its members: as many as `sample.ensemble` allows.
 const MOST_MEMBERS: u64 = 64;
 
-/// A fit whose steps are told, as those after so many of so many; what it has when it is stopped is of no use.
+/// A fit whose steps are told, as those of so many; what it has when it is stopped is of no use.
 pub(crate) fn watched(
     stage: Stage,
     sample: usize,
-    canonical_from_user: Option<&Similarity>,
+    canonical_from_user: &Similarity,
     tell: &mut impl FnMut(&Progress<'_>) -> Result<(), Error>,
-    [before, total]: [usize; 2],
+    total: usize,
     fit: impl FnOnce(&mut dyn FnMut(&FitProgress<'_>) -> ControlFlow<()>) -> Result<Cloud, freerange_fit::FitError>,
 ) -> Result<Cloud, Error> {
-    if before == 0 {
-        tell(&Progress { sample, ..Progress::new(stage, 0, total) })?;
-    }
+    tell(&Progress { sample, ..Progress::new(stage, 0, total) })?;
     let mut stopped = Ok(());
     let cloud = fit(&mut |p| {
-        let estimate = canonical_from_user.map(|place| (Known::Fitted(p.cloud), place));
+        let estimate = Some((Known::Fitted(p.cloud), canonical_from_user));
         let loss = Some(p.loss);
-        stopped = tell(&Progress { sample, loss, estimate, ..Progress::new(stage, before + p.step, total) });
+        stopped = tell(&Progress { sample, loss, estimate, ..Progress::new(stage, p.step, total) });
         if stopped.is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
     });
     stopped?;

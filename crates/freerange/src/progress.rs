@@ -64,8 +64,10 @@ pub struct Progress<'a> {
 pub(crate) enum Known<'a> {
     /// The state of a fit or a refinement.
     Fitted(&'a Cloud),
-    /// The network's estimates, one per seed.
+    /// The network's estimates, one per seed, where they lie.
     Sampled(&'a Estimate<'a>),
+    /// The same, `[objects][seeds]`.
+    Read(&'a [Vec<Cloud>]),
 }
 
 impl<'a> Progress<'a> {
@@ -85,6 +87,7 @@ impl<'a> Progress<'a> {
         let clouds = match known {
             Known::Fitted(cloud) => vec![cloud.clone()],
             Known::Sampled(estimate) => estimate.clouds()?.into_iter().flatten().collect(),
+            Known::Read(clouds) => clouds.concat(),
         };
         Ok(Some(clouds.iter().map(|cloud| to_user(cloud, place)).collect()))
     }

@@ -4,6 +4,7 @@ use std::{ops::ControlFlow, path::Path, time::Instant};
 
 use burn::tensor::Device;
 use freerange_camera::{CanonicalFrame, FrameConfig, Similarity, View, canonical_from_user, inputs_around};
+use freerange_core::side_by_side;
 use freerange_fit::{Evidence, FitProgress, HoldConfig, QuickFitConfig, RefineConfig, polish, refine, tree_slice};
 use freerange_flow::sample::{Estimate, SampleConfig, StartConfig, reconstruct};
 use freerange_model::Checkpoint;
@@ -188,35 +189,64 @@ impl Reconstructor {
         members: usize,
         tell: &mut impl FnMut(&Progress<'_>) -> Result<(), Error>,
     ) -> Result<Vec<Vec<Cloud>>, Error> {
-        let mut steps = Steps { done: 0, total: members * steps_of_member(options), tell };
-        steps.tell(None)?;
+        let (mut done, total) = (0, members * steps_of_member(options));
+        tell(&Progress::new(Stage::Sample, done, total))?;
+        let (place, seen) = (&placed.frame.canonical_from_user, &placed.seen());
+        let mut stopped = Ok(());
+        let mut step = |loss, known: Option<Known<'_>>| {
+            done += 1;
+            let estimate = known.map(|known| (known, place));
+            stopped = tell(&Progress { loss, estimate, ..Progress::new(Stage::Sample, done, total) });
+            if stopped.is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+        };
+        // The other members only help the first: nobody is shown them.
+        let sample = |member: usize, tell: &mut dyn FnMut(Step<'_>) -> ControlFlow<()>| {
+            let fits = fits.get(member).map(Vec::as_slice);
+            self.sample(seen, fits, options, member as u64, &mut |told| {
+                tell(Step { loss: told.loss, estimate: told.estimate.filter(|_| member == 0) })
+            })
+        };
+        let sampled: Vec<Result<Vec<Cloud>, Error>> = match self.device == Device::flex() {
+            // A device has one queue.
+            false => (0..members)
+                .map(|member| sample(member, &mut |told| step(told.loss, told.estimate.map(Known::Sampled))))
+                .collect(),
+            true => {
+                let sample = &sample;
+                let job = |member| {
+                    move |tell: &mut dyn FnMut(_) -> ControlFlow<()>| {
+                        sample(member, &mut |told| tell((told.loss, told.estimate.map(Estimate::clouds).transpose())))
+                    }
+                };
+                let mut failed = Ok(());
+                let sampled = side_by_side((0..members).map(job).collect(), |_, (loss, clouds)| match clouds {
+                    Ok(clouds) => step(loss, clouds.as_deref().map(Known::Read)),
+                    Err(error) => {
+                        failed = Err(error);
+                        ControlFlow::Break(())
+                    }
+                });
+                failed?;
+                sampled
+            }
+        };
+        stopped?;
         let mut clouds = vec![Vec::with_capacity(members); options.seeds.len()];
-        for member in 0..members {
-            // The other members only help the first: nobody is shown them.
-            let place = (member == 0).then_some(&placed.frame.canonical_from_user);
-            let sampled = self.sample(
-                placed.seen(),
-                fits.get(member).map(Vec::as_slice),
-                options,
-                member as u64,
-                place,
-                &mut steps,
-            )?;
-            clouds.iter_mut().zip(sampled).for_each(|(members, cloud)| members.push(cloud));
+        for sampled in sampled {
+            clouds.iter_mut().zip(sampled?).for_each(|(members, cloud)| members.push(cloud));
         }
         Ok(clouds)
     }
 
     /// One cloud per seed, of member `member` of an ensemble, for views and outlines in the canonical frame and their quick fits, one per seed,
-    /// if sampling starts from them. Estimates are shown where there is a `place`.
+    /// if sampling starts from them.
     fn sample(
         &self,
-        seen: Evidence<'_>,
+        seen: &Evidence<'_>,
         fits: Option<&[Cloud]>,
         options: &Options,
         member: u64,
-        place: Option<&Similarity>,
-        steps: &mut Steps<'_, impl FnMut(&Progress<'_>) -> Result<(), Error>>,
+        tell: &mut dyn FnMut(Step<'_>) -> ControlFlow<()>,
     ) -> Result<Vec<Cloud>, Error> {
         let config = &options.sample;
         if let (Some(fits), true) = (fits, options.without_network) {
@@ -225,22 +255,27 @@ impl Reconstructor {
         }
         // The first member is what it is without the others, which draw from far away.
         let seeds: Vec<u64> = options.seeds.iter().map(|seed| seed.wrapping_add(member << 32)).collect();
-        let views = seen.views;
-        let mut clouds = self.network(views, fits, config, &seeds, place, steps)?;
+        let mut clouds = self.network(seen.views, fits, config, &seeds, |estimate| {
+            tell(Step { loss: None, estimate: Some(estimate) })
+        })?;
         if config.polishing() > 0 {
             let quick = QuickFitConfig { iterations: config.polishing(), ..QuickFitConfig::default() };
             for (cloud, &seed) in clouds.iter_mut().zip(&seeds) {
-                let done = [steps.done, steps.total];
-                *cloud = watched(Stage::Sample, 0, None, steps.tell, done, |p| {
-                    polish(cloud, seen.clone(), &quick, seed, p)
+                let mut told = ControlFlow::Continue(());
+                *cloud = polish(cloud, seen.clone(), &quick, seed, |p| {
+                    told = tell(Step { loss: Some(p.loss), estimate: None });
+                    told
                 })?;
-                steps.done += quick.iterations;
+                if told.is_break() {
+                    return Err(Error::Cancelled);
+                }
             }
         }
         if let Some(mending) = config.mending() {
             for (cloud, seed) in clouds.iter_mut().zip(&seeds) {
                 let (fit, seed) = (std::slice::from_ref(&*cloud), std::slice::from_ref(seed));
-                let mended = self.network(views, Some(fit), &mending, seed, None, steps)?;
+                let told = |_: &Estimate<'_>| tell(Step { loss: None, estimate: None });
+                let mended = self.network(seen.views, Some(fit), &mending, seed, told)?;
                 *cloud = mended.into_iter().next().expect("one object, one seed");
             }
         }
@@ -254,17 +289,9 @@ impl Reconstructor {
         fits: Option<&[Cloud]>,
         config: &SampleConfig,
         seeds: &[u64],
-        place: Option<&Similarity>,
-        steps: &mut Steps<'_, impl FnMut(&Progress<'_>) -> Result<(), Error>>,
+        told: impl FnMut(&Estimate<'_>) -> ControlFlow<()>,
     ) -> Result<Vec<Cloud>, Error> {
-        let before = steps.done;
-        let told = |estimate: &Estimate<'_>| {
-            steps.done = before + estimate.index + 1;
-            let told = steps.tell(place.map(|place| (Known::Sampled(estimate), place)));
-            told.map_or(ControlFlow::Break(()), ControlFlow::Continue)
-        };
         let clouds = reconstruct(&self.checkpoint, &[views], fits, config, seeds, &self.device, told)?;
-        steps.done = before + config.steps;
         Ok(clouds.into_iter().flatten().collect())
     }
 }
@@ -276,17 +303,12 @@ fn steps_of_member(options: &Options) -> usize {
     config.steps + options.seeds.len() * (config.polishing() + mending)
 }
 
-/// How far sampling has come, and whom that is told.
-struct Steps<'a, T> {
-    done: usize,
-    total: usize,
-    tell: &'a mut T,
-}
-
-impl<T: FnMut(&Progress<'_>) -> Result<(), Error>> Steps<'_, T> {
-    fn tell(&mut self, estimate: Option<(Known<'_>, &Similarity)>) -> Result<(), Error> {
-        (self.tell)(&Progress { estimate, ..Progress::new(Stage::Sample, self.done, self.total) })
-    }
+/// What is told of a step of sampling.
+struct Step<'a> {
+    /// Of polishing.
+    loss: Option<f64>,
+    /// The network's, from the starts that the user knows.
+    estimate: Option<&'a Estimate<'a>>,
 }
 
 /// Restarts of k-means, as in the evaluation.
@@ -335,7 +357,7 @@ fn finished(
             };
             let config = RefineConfig { steps, hold, seed, ..RefineConfig::default() };
             let fit = |p: &mut dyn FnMut(&FitProgress<'_>) -> _| refine(&plain, &members, placed.all(), &config, p);
-            let refined = watched(Stage::Refine, i, Some(place), tell, [0, steps], fit)?;
+            let refined = watched(Stage::Refine, i, place, tell, steps, fit)?;
             (refined, Some(to_user(&plain, place)))
         }
     };
