@@ -149,6 +149,10 @@ fn an_ensemble_is_refined_together() {
         assert!(of(&estimates).len() == count && of(&estimates) == of(&own), "{stage}");
     }
     assert_eq!(alone.samples[0].unrefined, together.samples[0].unrefined);
+    // However many threads there are, and within a pool, where the caller is one of them.
+    let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    let same = one.install(|| model.run(&views, &options, &mut go)).unwrap();
+    assert_eq!(same.samples[0].gaussians, together.samples[0].gaussians);
     assert_ne!(alone.samples[0].gaussians, together.samples[0].gaussians);
     assert_eq!(alone.canonical_from_user, together.canonical_from_user);
 }
