@@ -10,11 +10,12 @@ use std::{
 
 /// Does all `jobs` at once, on rayon's threads, and returns what they give, in order. Each may send messages, which `told` hears on the calling
 /// thread, with the number of the job, in the order in which they come. Once it breaks, it hears no more, and every job is answered `Break`.
+/// Messages that are not heard yet are kept. A caller that is a thread of a pool itself may do a job in between, and hears of it afterwards.
 ///
 /// Small pieces of work that follow one another leave threads idle between them; several rows of them fill each other's gaps.
 ///
 /// # Panics
-/// If a job does.
+/// If a job or `told` does.
 pub fn side_by_side<J, M, T>(jobs: Vec<J>, mut told: impl FnMut(usize, M) -> ControlFlow<()>) -> Vec<T>
 where
     J: FnOnce(&mut dyn FnMut(M) -> ControlFlow<()>) -> T + Send,
@@ -22,25 +23,25 @@ where
     T: Send,
 {
     let (sender, receiver) = channel();
-    let ended = AtomicBool::new(false);
+    let ended = &AtomicBool::new(false);
     let mut results: Vec<Option<T>> = jobs.iter().map(|_| None).collect();
     rayon::in_place_scope(|scope| {
         for (number, (job, result)) in jobs.into_iter().zip(&mut results).enumerate() {
-            let (sender, ended) = (sender.clone(), &ended);
+            let sender = sender.clone();
             scope.spawn(move |_| {
                 let mut tell = |message| {
-                    // Nobody listens where `told` has panicked.
-                    let heard = sender.send((number, message)).is_ok();
-                    if heard && !ended.load(Ordering::Relaxed) {
-                        ControlFlow::Continue(())
-                    } else {
-                        ControlFlow::Break(())
+                    if ended.load(Ordering::Relaxed) {
+                        return ControlFlow::Break(());
                     }
+                    sender.send((number, message)).expect("the receiver outlives the scope");
+                    ControlFlow::Continue(())
                 };
                 *result = Some(job(&mut tell));
             });
         }
         drop(sender);
+        // The scope waits for all jobs, even where `told` panics.
+        let _end = End(ended);
         // A thread of the pool must not wait for the others: it may be the only one.
         let pooled = rayon::current_thread_index().is_some();
         loop {
@@ -59,6 +60,15 @@ where
         }
     });
     results.into_iter().map(|result| result.expect("every job ends before the scope does")).collect()
+}
+
+/// Ends the jobs when it goes.
+struct End<'a>(&'a AtomicBool);
+
+impl Drop for End<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
 }
 
 #[cfg(test)]
