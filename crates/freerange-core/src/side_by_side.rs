@@ -10,7 +10,7 @@ use std::{
 
 /// Does all `jobs` at once, on rayon's threads, and returns what they give, in order. Each may send messages, which `told` hears on the calling
 /// thread, with the number of the job, in the order in which they come. Once it breaks, it hears no more, and every job is answered `Break`.
-/// Messages that are not heard yet are kept. A caller that is a thread of a pool itself may do a job in between, and hears of it afterwards.
+/// Messages that are not heard yet are kept: a job may be done before its first is heard. A caller that is a thread of a pool itself may do a job in between, and hears of it afterwards.
 ///
 /// Small pieces of work that follow one another leave threads idle between them; several rows of them fill each other's gaps.
 ///

@@ -150,15 +150,19 @@ pub fn find_mirror(
         .into_iter()
         .map(|(_, plane)| move |tell: &mut dyn FnMut(()) -> ControlFlow<()>| fitted(plane, tell))
         .collect();
+    let mut told = ControlFlow::Continue(());
     let fitted = side_by_side(jobs, |_, ()| {
         search.done += 1;
-        (search.progress)(search.done)
+        told = (search.progress)(search.done);
+        told
     });
+    // All may be done before anyone hears of it.
+    if told.is_break() {
+        return Ok(None);
+    }
     let mut least: Option<FoundMirror> = None;
     for found in fitted {
-        // None where the search was ended.
-        let Some(found) = found? else { return Ok(None) };
-        if found.doubt <= least.map_or(most, |least| least.doubt) {
+        if let Some(found) = found?.filter(|found| found.doubt <= least.map_or(most, |least| least.doubt)) {
             least = Some(found);
         }
     }
