@@ -197,7 +197,7 @@ say("3 objects evaluated and 3 scenes made by 1, 2 and 4 ranks", "as by one proc
 
 # Kills.
 long = place / "long.toml"
-long.write_text(CONFIG % (120 + 60 * kills))
+long.write_text(CONFIG % (50 + 40 * kills))
 whole = place / "whole"
 train(long, whole, 2)
 run = place / "killed"
