@@ -206,8 +206,8 @@ impl Reconstructor {
                 tell(Step { loss: told.loss, estimate: told.estimate.filter(|_| member == 0) })
             })
         };
-        let sampled: Vec<Result<Vec<Cloud>, Error>> = match self.device == Device::flex() {
-            // A device has one queue.
+        let sampled: Result<Vec<Vec<Cloud>>, Error> = match self.device == Device::flex() {
+            // A device has one queue. The first that is ended is the last.
             false => (0..members)
                 .map(|member| sample(member, &mut |told| step(told.loss, told.estimate.map(Known::Sampled))))
                 .collect(),
@@ -227,13 +227,13 @@ impl Reconstructor {
                     }
                 });
                 failed?;
-                sampled
+                sampled.into_iter().collect()
             }
         };
         stopped?;
         let mut clouds = vec![Vec::with_capacity(members); options.seeds.len()];
-        for sampled in sampled {
-            clouds.iter_mut().zip(sampled?).for_each(|(members, cloud)| members.push(cloud));
+        for sampled in sampled? {
+            clouds.iter_mut().zip(sampled).for_each(|(members, cloud)| members.push(cloud));
         }
         Ok(clouds)
     }
