@@ -203,23 +203,24 @@ fn place_of(row: &[f32; channel::COUNT], unit: [f32; 3], views: &[Seen]) -> [f32
 /// Distance to the outline in pixels, positive within; by chamfers, within a tenth.
 fn outline(photo: &[[f32; 4]], w: usize, h: usize) -> Vec<f32> {
     const FAR: f32 = 1e4; // where there is nothing to be far from
+    let stride = w + 2; // a frame of one pixel that is far from all, so that every pixel has neighbours
+    let pixels = || (0..h).flat_map(|y| (0..w).map(move |x| (y + 1) * stride + x + 1));
     let to = |what: bool| {
-        let mut d: Vec<f32> = photo.iter().map(|p| if (p[3] > 0.5) == what { 0.0 } else { FAR }).collect();
-        for forward in [true, false] {
-            for k in 0..w * h {
-                let k = if forward { k } else { w * h - 1 - k };
-                let s = if forward { -1 } else { 1 };
-                for (dx, dy, step) in [(s, 0, 1.0), (0, s, 1.0), (s, s, 1.414), (-s, s, 1.414)] {
-                    let at = (k % w).checked_add_signed(dx).zip((k / w).checked_add_signed(dy));
-                    if let Some((x, y)) = at.filter(|&(x, y)| x < w && y < h) {
-                        d[k] = d[k].min(d[y * w + x] + step);
-                    }
-                }
-            }
+        let mut d = vec![FAR; stride * (h + 2)];
+        for (k, p) in pixels().zip(photo) {
+            d[k] = if (p[3] > 0.5) == what { 0.0 } else { FAR };
+        }
+        let steps = [(1, 1.0), (stride, 1.0), (stride + 1, 1.414), (stride - 1, 1.414)];
+        for k in pixels() {
+            d[k] = steps.iter().fold(d[k], |least, &(back, step)| least.min(d[k - back] + step));
+        }
+        for k in pixels().rev() {
+            d[k] = steps.iter().fold(d[k], |least, &(ahead, step)| least.min(d[k + ahead] + step));
         }
         d
     };
-    to(false).iter().zip(to(true)).map(|(out, within)| out - within).collect()
+    let (out, within) = (to(false), to(true));
+    pixels().map(|k| out[k] - within[k]).collect()
 }
 
 #[cfg(test)]
