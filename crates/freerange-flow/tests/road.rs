@@ -10,7 +10,7 @@ use freerange_fit::tree_slice;
 use freerange_flow::{
     FlowError,
     batch::{Batch, step_rng},
-    config::{FrameJitter, Symmetries},
+    config::{FrameJitter, RateSchedule, Symmetries},
     photometric::{Photometric, Targets},
     sample::{Estimate, PhotometricStep, SampleConfig, reconstruct},
     trainer::{Initial, Trainer},
@@ -229,6 +229,25 @@ fn another_configuration_in_the_same_folder_is_refused() {
     other.optimizer.learning_rate = 1.0;
     let e = Trainer::open(other, folder.path(), None, &Device::flex(), |_| {}).err().expect("refused").to_string();
     assert!(e.contains("another configuration"), "{e}");
+}
+
+/// As a branch does whose rate is brought down: the average goes on from where it was, and follows faster.
+#[test]
+fn a_run_may_go_on_with_another_end_and_another_average() {
+    let average = |ema: f32| {
+        let folder = tempfile::tempdir().unwrap();
+        train(&config(4), folder.path(), 2);
+        let mut other = config(3);
+        other.optimizer.ema = ema;
+        other.optimizer.schedule = RateSchedule::Constant { decay: 1 };
+        let losses = train(&other, folder.path(), 3);
+        assert_eq!(losses.len(), 1);
+        let checkpoint = Checkpoint::load(&folder.path().join("checkpoint.safetensors"), &Device::flex()).unwrap();
+        (losses, checkpoint.model.parameters())
+    };
+    let ((losses, none), (others, slow)) = (average(0.0), average(0.9999));
+    assert_eq!(losses, others);
+    assert_ne!(none, slow);
 }
 
 #[test]

@@ -29,7 +29,7 @@ fn check_same_run<M: Making>(config: &TrainConfig<M>, folder: &Path) -> Result<(
         Ok(old) => {
             let old: TrainConfig<M> =
                 toml::from_str(&old).map_err(|e| FlowError::State { path: path.clone(), problem: e.to_string() })?;
-            // Running longer is no other run; neither is sampling or measuring otherwise, or with more threads.
+            // Running longer is no other run; neither is sampling, measuring or averaging otherwise, or with more threads.
             let essence = |c: &TrainConfig<M>| {
                 let mut c = c.clone();
                 c.stages.iter_mut().for_each(|s| s.steps = 0);
@@ -43,6 +43,8 @@ fn check_same_run<M: Making>(config: &TrainConfig<M>, folder: &Path) -> Result<(
                 c.optimizer.compute = Default::default();
                 c.optimizer.wire = Default::default();
                 c.optimizer.schedule = Default::default();
+                // A rate that is brought down wants an average that follows it.
+                c.optimizer.ema = Default::default();
                 c.validation = Default::default();
                 c
             };
