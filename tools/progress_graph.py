@@ -32,17 +32,18 @@ def main():
     ]
     for psnr in range(low, high + 1):
         out.append(f'<path d="M{LEFT} {y(psnr):.1f}H{WIDTH - RIGHT}" stroke="#ddd"/><text x="{LEFT - 8}" y="{y(psnr) + 4:.1f}" text-anchor="end">{psnr}</text>')
-    for samples in range(0, last + 1, 10_000):
+    for samples in range(0, last + 1, 20_000):
         out.append(f'<text x="{x(samples):.1f}" y="{HEIGHT - BOTTOM + 18}" text-anchor="middle">{samples // 1000}k</text>')
     out.append(f'<text x="{(LEFT + WIDTH - RIGHT) / 2}" y="{HEIGHT - 10}" text-anchor="middle">samples seen in training</text>')
     out.append(f'<text x="{LEFT}" y="18">PSNR in dB, {data["protocol"]}</text>')
     labels = []  # at the right, moved apart where they would touch
     for key, colour in COLOURS.items():
         points = sorted(data["points"], key=lambda p: p["samples"])
-        # What was tried and led nowhere (`aside`) has a point, and no line.
-        kept = [p for p in points if not p.get("aside")]
-        line = " ".join(f"{x(p['samples']):.1f},{y(p[key]):.1f}" for p in kept)
-        out.append(f'<polyline points="{line}" fill="none" stroke="{colour}" stroke-width="2"/>')
+        # A line per run. What was tried and led nowhere (`aside`) has a point, and no line.
+        for run in sorted({p.get("run", "") for p in points}):
+            kept = [p for p in points if p.get("run", "") == run and not p.get("aside")]
+            line = " ".join(f"{x(p['samples']):.1f},{y(p[key]):.1f}" for p in kept)
+            out.append(f'<polyline points="{line}" fill="none" stroke="{colour}" stroke-width="2"/>')
         out += [f'<circle cx="{x(p["samples"]):.1f}" cy="{y(p[key]):.1f}" r="{5 if p.get("shipped") else 3}" fill="{colour}"/>' for p in points]
         out.append(f'<path d="M{LEFT} {y(data["fit"][key]):.1f}H{WIDTH - RIGHT}" stroke="{colour}" stroke-dasharray="5 4"/>')
         before = y(data["before"][key])
