@@ -15,6 +15,7 @@ use glam::DVec3;
 use rand::{Rng, SeedableRng, seq::SliceRandom};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
+use rayon::prelude::*;
 
 use crate::{
     FlowError,
@@ -70,15 +71,18 @@ impl Conditioning {
         }
         let size = config.image_size;
         let (channels, grid) = (config.image_channels(), config.patches_per_side());
-        let (mut pixels, mut rays) = (Vec::new(), Vec::new());
-        for view in objects.iter().flatten() {
-            let view = resized(&Window::around(view).cut(view), size, size);
-            pixels.extend(to_f32_rgba(&view.image).chunks_exact(4).flat_map(|p| {
-                let on_white = |c: f32| c * p[3] + 1.0 - p[3];
-                [on_white(p[0]), on_white(p[1]), on_white(p[2]), p[3]].into_iter().take(channels)
-            }));
-            rays.extend(plucker(&view.camera, grid, grid, PatchLayout::Scaled));
-        }
+        let views: Vec<&View> = objects.iter().flatten().copied().collect();
+        let (pixels, rays): (Vec<_>, Vec<_>) = views
+            .into_par_iter()
+            .map(|view| {
+                let view = resized(&Window::around(view).cut(view), size, size);
+                let on_white = |p: &[f32; 4], c: usize| if c < 3 { p[c] * p[3] + 1.0 - p[3] } else { p[3] };
+                let all = to_f32_rgba(&view.image);
+                let pixels = all.as_chunks::<4>().0.iter().flat_map(|p| (0..channels).map(move |c| on_white(p, c)));
+                (pixels.collect::<Vec<f32>>(), plucker(&view.camera, grid, grid, PatchLayout::Scaled))
+            })
+            .unzip();
+        let (pixels, rays) = (pixels.concat(), rays.concat());
         let size = size as usize;
         Ok(Self {
             images: Tensor::from_data(TensorData::new(pixels, [b, v, size, size, channels]), device),
@@ -148,11 +152,14 @@ impl Batch {
 
         let at = |views: &[Vec<View>], size: u32| targets(views, size, &rows.backgrounds, device);
         let render_size = stage.render_size.unwrap_or(loss.render_size);
-        let seen: Vec<Vec<&View>> = rows.seen.iter().map(|o| o.iter().collect()).collect();
+        // Pictures are most of the work, and nothing of it is drawn.
+        let (seen_views, held_views): (Vec<Vec<View>>, Vec<Vec<View>>) =
+            rows.looks.par_iter().map(|look| (look.moved(&look.seen), look.moved(&look.held))).unzip();
+        let seen: Vec<Vec<&View>> = seen_views.iter().map(|o| o.iter().collect()).collect();
         let conditioning = Conditioning::new(&seen, model, device)?;
-        let gradient_targets = at(&rows.seen, stage.gradient_size.unwrap_or(loss.gradient_size))?;
-        let seen = at(&rows.seen, render_size)?;
-        let held = if loss.held_views > 0 { Some(at(&rows.held, render_size)?) } else { None };
+        let gradient_targets = at(&seen_views, stage.gradient_size.unwrap_or(loss.gradient_size))?;
+        let seen = at(&seen_views, render_size)?;
+        let held = if loss.held_views > 0 { Some(at(&held_views, render_size)?) } else { None };
         let shape = [b, n, channel::COUNT];
         let tensor = |values: Vec<f32>| Tensor::<3>::from_data(TensorData::new(values, shape), device);
         let data = tensor(rows.data);
@@ -186,7 +193,7 @@ fn draw_estimates(loss: &LossConfig, rng: &mut ChaCha8Rng) -> usize {
 
 /// Views at most `size` pixels wide and high, in front of each object's background.
 fn targets(views: &[Vec<View>], size: u32, backgrounds: &[[f32; 3]], device: &Device) -> Result<Targets, FlowError> {
-    let small: Vec<Vec<View>> = views.iter().map(|o| o.iter().map(|v| shrink(v, size)).collect()).collect();
+    let small: Vec<Vec<View>> = views.par_iter().map(|o| o.iter().map(|v| shrink(v, size)).collect()).collect();
     let small: Vec<Vec<&View>> = small.iter().map(|o| o.iter().collect()).collect();
     Ok(Images::new(&small, device)?.on(backgrounds))
 }
@@ -207,7 +214,7 @@ struct Common<'a> {
 
 /// The objects of a batch one after the other: see [`Batch`].
 #[derive(Default)]
-struct Rows {
+struct Rows<'a> {
     data: Vec<f32>,
     noise: Vec<f32>,
     on_path: Vec<f32>,
@@ -215,14 +222,31 @@ struct Rows {
     t: Vec<f32>,
     conditional: Vec<f32>,
     backgrounds: Vec<[f32; 3]>,
-    seen: Vec<Vec<View>>,
-    held: Vec<Vec<View>>,
+    looks: Vec<Look<'a>>,
 }
 
-impl Rows {
+/// Which views of an object, and how they and it are changed.
+struct Look<'a> {
+    seen: Vec<&'a View>,
+    held: Vec<&'a View>,
+    symmetry: Symmetry,
+    frame: Similarity,
+}
+
+impl Look<'_> {
+    fn moved(&self, views: &[&View]) -> Vec<View> {
+        let moved = |v: &&View| {
+            let v = self.symmetry.view(v);
+            View { camera: v.camera.transformed(&self.frame), ..v }
+        };
+        views.iter().map(moved).collect()
+    }
+}
+
+impl<'a> Rows<'a> {
     fn draw(
         &mut self,
-        object: &Object,
+        object: &'a Object,
         fit: Option<&InputFit>,
         common: &Common<'_>,
         rng: &mut ChaCha8Rng,
@@ -248,7 +272,7 @@ impl Rows {
         self.t.push(time);
         self.conditional.push(if blind { 0.0 } else { 1.0 });
         self.backgrounds.push(draw_background(rng));
-        let (chosen, rest) = match fit {
+        let (seen, mut held) = match fit {
             Some(fit) => views_of(fit, &object.views, rng),
             None => choose_views(&object.views, inputs, one_sided, rng),
         };
@@ -257,12 +281,8 @@ impl Rows {
         if frame != Similarity::IDENTITY {
             slice.transform(frame.scale, frame.rotation, frame.translation);
         }
-        let moved = |v: &View| {
-            let v = symmetry.view(v);
-            View { camera: v.camera.transformed(&frame), ..v }
-        };
-        self.seen.push(chosen.into_iter().map(moved).collect::<Vec<_>>());
-        self.held.push(rest.into_iter().take(loss.held_views).map(moved).collect::<Vec<_>>());
+        held.truncate(loss.held_views);
+        self.looks.push(Look { seen, held, symmetry, frame });
         let clean = normalization.normalize(&slice);
         match fit {
             None => loss.coupling.pair(&mut epsilon, &clean),

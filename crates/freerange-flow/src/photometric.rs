@@ -5,6 +5,7 @@ use freerange_camera::{Camera, View, image_ops::to_f32_rgba};
 use freerange_model::OBSERVATION;
 use freerange_raster::{RasterConfig, rasterize};
 use freerange_splat::{Normalization, channel};
+use rayon::prelude::*;
 
 use crate::{FlowError, place::place};
 
@@ -26,19 +27,20 @@ impl Images {
         let first = objects.first().and_then(|o| o.first()).ok_or(FlowError::NoViews)?;
         let (w, h) = first.image.dimensions();
         let views = objects[0].len();
-        let pixels = objects.len() * views * (w * h) as usize;
-        let (mut colors, mut transparency) = (Vec::with_capacity(pixels * 3), Vec::with_capacity(pixels));
-        for object in objects {
-            for view in object {
-                if view.image.dimensions() != (w, h) || object.len() != views {
-                    return Err(FlowError::UnevenViews { expected: (w, h), found: view.image.dimensions() });
-                }
-                for p in to_f32_rgba(&view.image).as_chunks::<4>().0 {
-                    colors.extend([p[3] * p[0], p[3] * p[1], p[3] * p[2]]);
-                    transparency.push(1.0 - p[3]);
-                }
+        for view in objects.iter().flatten() {
+            if view.image.dimensions() != (w, h) {
+                return Err(FlowError::UnevenViews { expected: (w, h), found: view.image.dimensions() });
             }
         }
+        if objects.iter().any(|object| object.len() != views) {
+            return Err(FlowError::UnevenViews { expected: (w, h), found: (w, h) });
+        }
+        let split = |object: &Vec<&View>| {
+            let pixels = object.iter().flat_map(|view| to_f32_rgba(&view.image).as_chunks::<4>().0.to_vec());
+            pixels.map(|[r, g, b, a]| ([a * r, a * g, a * b], 1.0 - a)).unzip::<_, _, Vec<[f32; 3]>, Vec<f32>>()
+        };
+        let (colors, transparency): (Vec<_>, Vec<_>) = objects.par_iter().map(split).unzip();
+        let (colors, transparency) = (colors.concat().into_flattened(), transparency.concat());
         let shape = |channels: usize| [objects.len(), views, h as usize, w as usize, channels];
         Ok(Self {
             cameras: objects.iter().map(|o| o.iter().map(|v| v.camera).collect()).collect(),
