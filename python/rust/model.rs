@@ -78,8 +78,8 @@ impl Model {
 
     /// Gaussians that it makes, before refinement.
     #[getter]
-    fn gaussians(&self) -> usize {
-        1 << self.model.checkpoint().depth
+    fn gaussians(&self) -> PyResult<usize> {
+        self.model.gaussians().map_err(of_model)
     }
 
     /// What the checkpoint says of its making, as JSON.

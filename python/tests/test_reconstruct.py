@@ -258,7 +258,7 @@ def test_bad_files_and_names_are_named(tmp_path):
 
 def test_what_it_says_of_itself(model):
     assert freerange.devices()[-1][0] == "cpu"
-    assert model.device == "cpu" and model.gaussians == 1024 and model.views == 6
+    assert model.device == "cpu" and model.gaussians == 2048 and model.views == 6
     assert model.provenance["configuration"]
-    assert "1024 Gaussians" in repr(model)
+    assert "2048 Gaussians" in repr(model)
     json.dumps(model.provenance)

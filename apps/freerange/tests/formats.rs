@@ -139,9 +139,9 @@ fn a_model_is_exported_with_its_card() {
     for line in ["license:\n- mit\n- apache-2.0", "library_name: freerange", "pipeline_tag: image-to-3d"] {
         assert!(head.contains(line), "{head}");
     }
-    assert!(card.contains("19,811,000 parameters") && card.contains("1024 3D Gaussians"));
+    assert!(card.contains("19,811,000 parameters") && card.contains("2048 3D Gaussians"));
     let config: serde_json::Value = serde_json::from_slice(&fs::read(model.join("config.json")).unwrap()).unwrap();
-    assert_eq!((&config["model_type"], &config["gaussians"]), (&"free-range".into(), &1024.into()));
+    assert_eq!((&config["model_type"], &config["gaussians"]), (&"free-range".into(), &2048.into()));
     // The weights are those of the checkpoint, and exporting them again says where they came from.
     let weights = model.join("model.safetensors");
     let again = folder.path().join("again");

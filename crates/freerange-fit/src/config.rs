@@ -135,7 +135,7 @@ impl Default for RefineConfig {
     fn default() -> Self {
         Self {
             steps: 500,
-            gaussians: 4096,
+            gaussians: 8192,
             growth_rounds: 16,
             rates: Rates { mean: 1.5e-3, scale: 5e-3, ..FitConfig::default().rates },
             final_mean_rate: 1.5e-5,
@@ -361,7 +361,7 @@ mod tests {
             assert_eq!(rounds > 0, growth_rounds > 0 && steps > 2, "{rounds} of {growth_rounds}");
             assert!(rounds <= 2 * growth_rounds, "{rounds} of {growth_rounds}");
             let grown = (0..rounds).fold(start, |count, _| crate::mcmc::grown(count, &fit));
-            assert!(rounds == 0 || grown == start.max(4096), "{grown} after {rounds}");
+            assert!(rounds == 0 || grown == start.max(8192), "{grown} after {rounds}");
         }
     }
 }

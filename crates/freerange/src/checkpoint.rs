@@ -7,7 +7,7 @@ use std::{
 
 use burn::tensor::Device;
 use freerange_core::{IoError, sha256};
-use freerange_flow::trainer::EncoderWeights;
+use freerange_flow::{sample::SampleConfig, trainer::EncoderWeights};
 use freerange_model::{Checkpoint, Dinov2, EncoderConfig, Header};
 
 use crate::{Error, machine::weights_folder};
@@ -52,6 +52,20 @@ pub fn checkpoint_sha256(path: Option<&Path>) -> Result<String, Error> {
 pub fn checkpoint_header(path: Option<&Path>) -> Result<Header, Error> {
     let (bytes, name) = read(path)?;
     Ok(Checkpoint::header(&bytes, name)?)
+}
+
+/// How a checkpoint with this provenance is sampled from by default.
+///
+/// # Errors
+/// If what it says of that cannot be used.
+pub fn sampling(provenance: &serde_json::Value) -> Result<SampleConfig, Error> {
+    let sample: SampleConfig = match provenance.get("sample") {
+        Some(value) => serde_json::from_value(value.clone())
+            .map_err(|e| Error::input("checkpoint: field `sample` of the metadata", "settings of sampling", e))?,
+        None => SampleConfig::default(),
+    };
+    sample.validate()?;
+    Ok(sample)
 }
 
 /// Reads this checkpoint, or the shipped one, with its encoder's weights if those are published ones.

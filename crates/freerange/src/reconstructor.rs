@@ -14,7 +14,7 @@ use crate::{
     EncoderPlaces, Error, Options, Progress, Stage, load_checkpoint,
     placed::{Placed, watched},
     progress::Known,
-    require,
+    require, sampling,
 };
 
 /// A model on a device, ready to reconstruct one object after the other.
@@ -91,11 +91,7 @@ impl Reconstructor {
     /// # Errors
     /// If what the checkpoint says of it cannot be used.
     pub fn options(&self) -> Result<Options, Error> {
-        let sample: SampleConfig = match self.checkpoint.provenance.get("sample") {
-            Some(value) => serde_json::from_value(value.clone())
-                .map_err(|e| Error::input("checkpoint: field `sample` of the metadata", "settings of sampling", e))?,
-            None => SampleConfig::default(),
-        };
+        let sample = sampling(&self.checkpoint.provenance)?;
         Ok(Options { sample, seeds: vec![0], views: None, without_network: false, frame: FrameConfig::default() })
     }
 
@@ -103,6 +99,14 @@ impl Reconstructor {
     pub fn views(&self) -> usize {
         let told = self.checkpoint.provenance.pointer("/configuration/loss/input_views/1");
         told.and_then(serde_json::Value::as_u64).and_then(|n| n.try_into().ok()).filter(|n| *n > 0).unwrap_or(4)
+    }
+
+    /// Gaussians that it makes by default, before refinement.
+    ///
+    /// # Errors
+    /// If what the checkpoint says of sampling cannot be used.
+    pub fn gaussians(&self) -> Result<usize, Error> {
+        Ok(1 << sampling(&self.checkpoint.provenance)?.depth_of(self.checkpoint.depth))
     }
 
     /// Refuses options that this model or its device cannot follow.
@@ -250,7 +254,7 @@ impl Reconstructor {
     ) -> Result<Vec<Cloud>, Error> {
         let config = &options.sample;
         if let (Some(fits), true) = (fits, options.without_network) {
-            let depth = config.depth.unwrap_or(self.checkpoint.depth);
+            let depth = config.depth_of(self.checkpoint.depth);
             return fits.iter().map(|fit| Ok(tree_slice(fit, depth)?)).collect();
         }
         // The first member is what it is without the others, which draw from far away.

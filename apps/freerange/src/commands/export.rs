@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use freerange::{checkpoint_bytes, checkpoint_header};
+use freerange::{checkpoint_bytes, checkpoint_header, sampling};
 use freerange_model::Header;
 
 use crate::{error::CliError, output::OutputFolder, runtime};
@@ -39,24 +39,25 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     let path = runtime::local_or_shipped(args.checkpoint.as_deref())?;
     let bytes = checkpoint_bytes(path.as_deref())?;
     let checkpoint = checkpoint_header(path.as_deref())?;
+    let gaussians = 1u64 << sampling(&checkpoint.provenance)?.depth_of(checkpoint.depth);
     let config = serde_json::json!({
         "model_type": "free-range",
         "library_name": "freerange",
-        "gaussians": 1u64 << checkpoint.depth,
+        "gaussians": gaussians,
         "architecture": checkpoint.config,
         "sample": checkpoint.provenance.get("sample"),
     });
     let output = OutputFolder::create("model export", &args.output)?;
     output.write("config.json", (serde_json::to_string_pretty(&config).map_err(CliError::input)? + "\n").as_bytes())?;
     output.write(runtime::WEIGHTS, &bytes)?;
-    output.write("README.md", card(args, &checkpoint)?.as_bytes())?;
+    output.write("README.md", card(args, &checkpoint, gaussians)?.as_bytes())?;
     output.commit()?;
     println!("{}", args.output.display());
     Ok(())
 }
 
 /// The model's card: what hubs read, how it is used, what is known of it.
-fn card(args: &Args, checkpoint: &Header) -> Result<String, CliError> {
+fn card(args: &Args, checkpoint: &Header, gaussians: u64) -> Result<String, CliError> {
     let licenses = match args.license.is_empty() {
         true => vec!["mit".to_owned(), "apache-2.0".to_owned()],
         false => args.license.clone(),
@@ -73,8 +74,7 @@ fn card(args: &Args, checkpoint: &Header) -> Result<String, CliError> {
     Ok(format!(
         "---\nlicense:\n{licenses}library_name: freerange\npipeline_tag: image-to-3d\ntags:\n- gaussian-splatting\n- 3d\n---\n\n\
          # {title}\n\n\
-         Makes {} 3D Gaussians of an object from a few posed photos, with the program `freerange`:\n\n\
-         ```sh\nfreerange reconstruct SCENE -o out --checkpoint model.safetensors\n```\n\n{about}",
-        1u64 << checkpoint.depth,
+         Makes {gaussians} 3D Gaussians of an object from a few posed photos, with the program `freerange`:\n\n\
+         ```sh\nfreerange reconstruct SCENE -o out --checkpoint model.safetensors\n```\n\n{about}"
     ))
 }

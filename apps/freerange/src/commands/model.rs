@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use freerange::{EncoderPlaces, checkpoint_header, load_checkpoint};
+use freerange::{EncoderPlaces, checkpoint_header, load_checkpoint, sampling};
 use freerange_model::{Compute, Execution, ModelConfig, ModelInfo, WeightsOrigin, Workload};
 
 use crate::{
@@ -129,7 +129,8 @@ fn info(args: &Info) -> Result<(), CliError> {
         }
         (file, _) => {
             let c = checkpoint_header(runtime::local_or_shipped(file.as_deref())?.as_deref())?;
-            (c.config, c.depth, 1, Compute::F32, false, Some((c.provenance, c.encoder_weights)))
+            let depth = sampling(&c.provenance)?.depth_of(c.depth);
+            (c.config, depth, 1, Compute::F32, false, Some((c.provenance, c.encoder_weights)))
         }
     };
     let workload = Workload { batch: args.batch.unwrap_or(batch), views: args.views, gaussians: 1 << depth };

@@ -88,7 +88,7 @@ pub struct Sampling {
     /// where it was when the model was trained, or where `freerange weights fetch` puts it].
     #[arg(long, value_name = "FOLDER", requires = "checkpoint")]
     pub encoder_weights: Option<PathBuf>,
-    /// Continue from the sample with so many steps of 3DGS-MCMC on the input views, up to 4,096 Gaussians and held in
+    /// Continue from the sample with so many steps of 3DGS-MCMC on the input views, up to 8,192 Gaussians and held in
     /// place where no view looks; 500 are enough, 0 is none [default: the checkpoint's].
     #[arg(long, value_name = "STEPS")]
     pub refine: Option<usize>,

@@ -175,6 +175,11 @@ impl SampleConfig {
         (self.mend > 0 && self.start.is_none()).then_some(held)
     }
 
+    /// Depth of the level-of-detail tree whose slice is made, by a model that was trained at depth `trained`: `2^depth` Gaussians.
+    pub fn depth_of(&self, trained: u32) -> u32 {
+        self.depth.unwrap_or(trained)
+    }
+
     /// Refuses impossible values.
     pub fn validate(&self) -> Result<(), FlowError> {
         let bad = |field: &str, expected: &str, found: String| {

@@ -55,7 +55,7 @@ impl Drawn {
         seeds: &[u64],
         device: &Device,
     ) -> Result<Self, FlowError> {
-        let (depth, fewest) = (config.depth.unwrap_or(checkpoint.depth), checkpoint.config.gaussians_per_token);
+        let (depth, fewest) = (config.depth_of(checkpoint.depth), checkpoint.config.gaussians_per_token);
         if 1usize << depth < fewest {
             let expected = format!("at least {}: a token of the model is {fewest} Gaussians", fewest.ilog2());
             return Err(Invalid::new("sample.depth", expected, depth).into());
