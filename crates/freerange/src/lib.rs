@@ -39,7 +39,9 @@ mod reconstructor;
 mod score;
 
 pub use burn::tensor::Device;
-pub use checkpoint::{EncoderPlaces, checkpoint_bytes, checkpoint_header, checkpoint_sha256, load_checkpoint, sampling};
+pub use checkpoint::{
+    EncoderPlaces, checkpoint_bytes, checkpoint_header, checkpoint_sha256, load_checkpoint, sampling,
+};
 pub use device::{Api, DeviceName, Listed, Properties, devices, require};
 pub use error::Error;
 pub use freerange_camera::{Camera, FrameConfig, Scene, Similarity, Up, View};
