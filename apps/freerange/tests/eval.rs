@@ -408,7 +408,7 @@ fn generated_objects_several_samples_shares_and_no_folder() {
         let m = &record["outcome"];
         assert!(m["disagreement"].as_f64().unwrap() > 0.0, "{m}");
         assert_eq!(m["samples"].as_array().unwrap().len(), 2);
-        assert_eq!(m["samples"][0]["gaussians"], 1024);
+        assert_eq!(m["samples"][0]["gaussians"], 2048);
         assert_eq!(m["image_size"], serde_json::json!([32, 32]));
         assert_eq!(
             (m["inputs"].as_array().unwrap().len(), m["samples"][0]["views"].as_array().unwrap().len()),
