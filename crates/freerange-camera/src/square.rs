@@ -2,12 +2,17 @@
 
 use std::borrow::Cow;
 
+use glam::DVec3;
 use image::RgbaImage;
 
-use crate::{Camera, View};
+use crate::{CANONICAL_RADIUS, Camera, View};
 
 /// Alpha from which a pixel belongs to the object.
 const SOLID: u8 = 128;
+/// How much of a [framed](Window::framed) picture the canonical sphere spans: about as much as in training's.
+const FILL: f64 = 0.75;
+/// Square pictures on which it spans less are framed anew; training's cameras have it on a half at least.
+const LEAST_FILL: f64 = 0.45;
 
 /// A square of a view's image; it may reach beyond two opposite borders, and is transparent there.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -34,13 +39,48 @@ impl Window {
         Self::of(view, false)
     }
 
+    /// The square about the canonical sphere in which it is as large as training's views have it, and with it all of the
+    /// object. For a view in the canonical frame that is not square, or shows the sphere small; none for others, and where
+    /// such a square is not within the image.
+    pub fn framed(view: &View) -> Option<Self> {
+        let c = &view.camera;
+        let short = i64::from(c.width.min(c.height));
+        let middle = c.world_to_camera.transform_point3(DVec3::ZERO);
+        // Phrased so that NaN fails it.
+        let ahead = middle.z > CANONICAL_RADIUS && middle.is_finite();
+        if !ahead {
+            return None;
+        }
+        let across = 2.0 * (CANONICAL_RADIUS / middle.length()).asin().tan() * c.fx.max(c.fy);
+        if c.width == c.height && across >= LEAST_FILL * short as f64 {
+            return None;
+        }
+        // No wider than the image: what it does not show is not known to be empty.
+        let half = (0.5 * across / FILL).min(0.5 * short as f64);
+        let along = |focal: f64, centre: f64, at: f64, size: u32| {
+            let middle = (focal * at / middle.z + centre).clamp(half, f64::from(size) - half);
+            let low = (middle - half).floor() as i64;
+            (low, low + (2.0 * half).ceil() as i64)
+        };
+        let (mut x, mut y) = (along(c.fx, c.cx, middle.x, c.width), along(c.fy, c.cy, middle.y, c.height));
+        // Faint edges are the object's, too.
+        if let Some((seen_x, seen_y)) = extents(&view.image, 1) {
+            let both = |a: (i64, i64), b: Extent| (a.0.min(b.0.into()), a.1.max(b.1.into()));
+            (x, y) = (both(x, seen_x), both(y, seen_y));
+        }
+        let side = (x.1 - x.0).max(y.1 - y.0);
+        let start = |(low, high): (i64, i64), size: u32| ((low + high - side) / 2).clamp(0, i64::from(size) - side);
+        let smaller = side <= short && (c.width, c.height) != (side as u32, side as u32);
+        smaller.then(|| Self { left: start(x, c.width), top: start(y, c.height), side: side as u32 })
+    }
+
     fn of(view: &View, whole: bool) -> Self {
         let (w, h) = view.image.dimensions();
         let short = w.min(h);
         if w == h {
             return Self { left: 0, top: 0, side: short };
         }
-        let (across, down) = extents(&view.image).unwrap_or(((0, w), (0, h)));
+        let (across, down) = extents(&view.image, SOLID).unwrap_or(((0, w), (0, h)));
         let masked = (across, down) != ((0, w), (0, h));
         let (long, along, beside) = if w > h { (w, across, down) } else { (h, down, across) };
         let cut = beside.0 == 0 || beside.1 == short;
@@ -75,10 +115,10 @@ impl Window {
     }
 }
 
-/// Where the object is, across and down; none where nothing is solid.
-fn extents(image: &RgbaImage) -> Option<(Extent, Extent)> {
+/// Where the object is, across and down; none where nothing has as much alpha.
+fn extents(image: &RgbaImage, least: u8) -> Option<(Extent, Extent)> {
     let (mut across, mut down) = ((u32::MAX, 0), (u32::MAX, 0));
-    for (x, y, _) in image.enumerate_pixels().filter(|(_, _, p)| p[3] >= SOLID) {
+    for (x, y, _) in image.enumerate_pixels().filter(|(_, _, p)| p[3] >= least) {
         across = (across.0.min(x), across.1.max(x + 1));
         down = (down.0.min(y), down.1.max(y + 1));
     }
@@ -126,6 +166,62 @@ mod tests {
                 }
             }
         }
+    }
+
+    /// A picture of the canonical sphere, solid, from 2 away; `fov` in radians across, the optical axis `off` pixels right of
+    /// the middle.
+    fn sphere(w: u32, h: u32, fov: f64, off: f64) -> View {
+        let mut camera = Camera::look_at(2.0 * DVec3::X, DVec3::ZERO, DVec3::Z, fov, w, h);
+        camera.cx += off;
+        let radius = CANONICAL_RADIUS / 2.0;
+        let image = RgbaImage::from_fn(w, h, |x, y| {
+            let ray = camera.ray_direction(f64::from(x) + 0.5, f64::from(y) + 0.5);
+            let solid = ray.cross(DVec3::X).length() < radius;
+            Rgba([x as u8, y as u8, 7, if solid { 255 } else { 0 }])
+        });
+        View { name: "v".into(), camera, image }
+    }
+
+    #[test]
+    fn photos_are_framed_about_the_sphere() {
+        // By hand: from twice its diameter away it spans 2 tan(asin(1 / 4)) focal lengths.
+        let across = |view: &View| 2.0 * (1.0 / 15f64.sqrt()) * view.camera.fx;
+        for (w, h, fov, off) in
+            [(200, 150, 0.9, 0.0), (150, 200, 0.9, 10.0), (200, 150, 0.9, -40.0), (160, 160, 1.5, 5.0)]
+        {
+            let view = sphere(w, h, fov, off);
+            let cut = Window::framed(&view).expect("a window").cut(&view).into_owned();
+            let fill = across(&view) / f64::from(cut.camera.width);
+            assert!((0.72..=0.75).contains(&fill), "{w} x {h}: {fill}");
+            let solid = |v: &View| v.image.pixels().filter(|p| p[3] > 0).count();
+            assert_eq!(solid(&cut), solid(&view));
+            for (x, y, p) in cut.image.enumerate_pixels().filter(|(_, _, p)| p[2] > 0) {
+                let (ox, oy) = (f64::from(p[0]) + 0.5, f64::from(p[1]) + 0.5);
+                let moved = cut.camera.ray_direction(f64::from(x) + 0.5, f64::from(y) + 0.5);
+                assert!(moved.abs_diff_eq(view.camera.ray_direction(ox, oy), 1e-12));
+            }
+            assert_eq!(cut.image.pixels().filter(|p| p[2] == 0).count(), 0, "nothing is padded");
+            assert_eq!(Window::framed(&cut), None, "once is enough");
+        }
+    }
+
+    #[test]
+    fn framing_loses_nothing_of_the_object() {
+        // Larger than the frame believes: the window follows the mask.
+        let mut view = sphere(200, 150, 0.9, 0.0);
+        view.image.put_pixel(40, 75, Rgba([40, 75, 7, 1]));
+        let cut = Window::framed(&view).expect("a window").cut(&view).into_owned();
+        assert!(cut.image.pixels().any(|p| p.0 == [40, 75, 7, 1]));
+        // Wider than the photo is high, or behind the camera: left alone.
+        view.image.put_pixel(1, 75, Rgba([1, 75, 7, 1]));
+        view.image.put_pixel(198, 75, Rgba([198, 75, 7, 1]));
+        assert_eq!(Window::framed(&view), None);
+        let mut behind = sphere(200, 150, 0.9, 0.0);
+        behind.camera.world_to_camera =
+            Camera::look_at(2.0 * DVec3::X, 3.0 * DVec3::X, DVec3::Z, 0.9, 4, 4).world_to_camera;
+        assert_eq!(Window::framed(&behind), None);
+        // Square, and as large as training has it.
+        assert_eq!(Window::framed(&sphere(160, 160, 0.9, 0.0)), None);
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use std::ops::ControlFlow;
 
-use freerange_camera::{CanonicalFrame, FrameConfig, Similarity, View};
+use freerange_camera::{CanonicalFrame, FrameConfig, Similarity, View, Window};
 use freerange_core::side_by_side;
 use freerange_fit::{
     Axis, Evidence, FitProgress, FoundAxis, FoundMirror, Outline, QuickFitConfig, axis_steps, find_axis, find_mirror,
@@ -20,7 +20,7 @@ use crate::{
 /// The views of an object, and those of them that the model is shown.
 pub(crate) struct Placed {
     pub frame: CanonicalFrame,
-    /// All of them, in the canonical frame.
+    /// All of them, in the canonical frame, photos [framed](Window::framed).
     pub canonical: Vec<View>,
     /// Which of them the model is shown, ascending.
     pub chosen: Vec<usize>,
@@ -37,7 +37,18 @@ pub(crate) struct Placed {
 impl Placed {
     /// At most `most` views are shown.
     pub fn new(views: &[View], config: &FrameConfig, most: usize) -> Result<Self, Error> {
-        let (mut frame, canonical) = to_canonical(views, config)?;
+        let (mut frame, mut canonical) = to_canonical(views, config)?;
+        let mut framed = 0;
+        for view in &mut canonical {
+            if let Some(window) = Window::framed(view) {
+                *view = window.cut(view).into_owned();
+                framed += 1;
+            }
+        }
+        if framed > 0 {
+            let all = views.len();
+            frame.notes.push(format!("{framed} of {all} views are cut to squares about the object"));
+        }
         let chosen = choose_views(views, most)?;
         if chosen.len() < views.len() {
             let names: Vec<&str> = chosen.iter().map(|&i| views[i].name.as_str()).collect();
@@ -48,9 +59,9 @@ impl Placed {
         let uneven = shown.iter().filter(|v| v.image.width() != v.image.height()).count();
         if uneven > 0 {
             let all = shown.len();
-            frame
-                .notes
-                .push(format!("{uneven} of {all} views are not square: the model is shown squares, cut or padded"));
+            frame.notes.push(format!(
+                "{uneven} of {all} views that the model is shown are not square: it sees squares, cut or padded"
+            ));
         }
         let settled = frame.kept;
         Ok(Self { frame, canonical, chosen, shown, axis: None, photos: views.len(), settled })

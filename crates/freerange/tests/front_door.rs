@@ -4,8 +4,9 @@ use std::{ops::ControlFlow, path::Path};
 
 use freerange::{
     Camera, Device, Error, Options, Progress, Reconstructor, SampleConfig, Scene, Similarity, Stage, View, score,
+    to_canonical,
 };
-use freerange_camera::Window;
+use freerange_camera::{FrameConfig, Window};
 use glam::{DQuat, DVec3};
 
 fn model() -> Reconstructor {
@@ -378,8 +379,12 @@ fn photos_of_any_shape_and_size_are_seen_undistorted() {
     };
     let photos =
         [on_a_sheet(&bowl[0], 700, 512, 150, 0), on_a_sheet(&bowl[1], 512, 640, 0, 30), small, bowl[3].clone()];
-    let squares = photos.each_ref().map(|v| Window::around(v).cut(v).into_owned());
-    assert_eq!(squares.each_ref().map(|v| v.image.dimensions()), [(512, 512), (512, 512), (300, 300), (512, 512)]);
+    // Two are cut to squares about the object, the others are squares.
+    let (_, canonical) = to_canonical(&photos, &FrameConfig::default()).unwrap();
+    let windows: Vec<_> = canonical.iter().map(Window::framed).collect();
+    assert_eq!(windows.iter().map(Option::is_some).collect::<Vec<_>>(), [true, true, false, false]);
+    let square = |(v, w): (&View, &Option<Window>)| w.map_or_else(|| v.clone(), |w| w.cut(v).into_owned());
+    let squares: Vec<View> = photos.iter().zip(&windows).map(square).collect();
     let mut options = model.options().unwrap();
     options.sample =
         SampleConfig { steps: 4, mirror: 0.0, turn: 0.0, polish: 0, refine: 0, ..options.sample.without_start() };
