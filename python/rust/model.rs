@@ -7,7 +7,9 @@ use std::{
     time::{Duration, Instant},
 };
 
-use freerange::{DeviceName, EncoderPlaces, FrameConfig, Options, Reconstructor, View, machine::cache_folder};
+use freerange::{
+    DeviceName, EncoderPlaces, FrameConfig, Options, Reconstructor, View, machine::cache_folder, others_show,
+};
 use freerange_hub::Hub;
 use freerange_scene::{cut, estimate::Hints};
 use glam::DVec3;
@@ -106,7 +108,7 @@ impl Model {
         options.frame = FrameConfig { up, center, radius, ..FrameConfig::default() };
         let notes = py.detach(|| {
             self.model.check(&options).map_err(of_model)?;
-            cut(&mut views, &Hints { center, radius }).map_err(of_scene)
+            cut(&mut views, &Hints { center, radius, others: Some(others_show) }).map_err(of_scene)
         })?;
         self.run(py, &views, &options, notes, on_step)
     }

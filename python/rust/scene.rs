@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use freerange::{Cloud, FrameConfig, View};
+use freerange::{Cloud, FrameConfig, View, others_show};
 use freerange_formats::{Frame, WriteOptions};
 use freerange_scene::{
     LoadConfig, Loaded, MaskSource,
@@ -67,7 +67,7 @@ pub fn read_scene(py: Python<'_>, path: PathBuf, photos: Photos, up: RawUp) -> P
         masks,
         invert_masks: photos.invert_masks,
         max_side: photos.max_side,
-        hints: Hints { center, radius: photos.radius },
+        hints: Hints { center, radius: photos.radius, others: Some(others_show) },
     };
     let up = up.read(true)?;
     py.detach(|| {

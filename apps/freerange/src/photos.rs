@@ -5,7 +5,7 @@ use std::{
     str::FromStr,
 };
 
-use freerange::{FrameConfig, Up};
+use freerange::{FrameConfig, Up, others_show};
 use freerange_scene::{
     LoadConfig, Loaded, MaskModel, MaskSource, PixelRange,
     estimate::Hints,
@@ -150,7 +150,7 @@ impl Photos {
             masks,
             invert_masks: self.invert_masks,
             max_side: self.max_side,
-            hints: Hints { center: self.center, radius: self.radius },
+            hints: Hints { center: self.center, radius: self.radius, others: Some(others_show) },
         }
     }
 

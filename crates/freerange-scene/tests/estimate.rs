@@ -3,7 +3,7 @@
 use freerange_camera::{Camera, View};
 use freerange_scene::{
     LoadConfig, MaskSource, SceneError,
-    estimate::{Hints, agreement, contradictions, masks, overlap, table_faces},
+    estimate::{Hints, OthersShow, agreement, contradictions, masks, overlap, table_faces},
     load,
     read::cameras,
 };
@@ -130,6 +130,61 @@ fn the_same_photos_give_the_same_masks() {
 }
 
 #[track_caller]
+/// What the others would show, were they to know all: where the object is, and the colour that it has there.
+fn truth_shown(views: &[View]) -> Result<Vec<RgbaImage>, String> {
+    let shown = |v: &View| {
+        let (mut image, (_, mask)) = (v.image.clone(), draw(&v.camera));
+        image.pixels_mut().zip(mask).for_each(|(p, m)| p[3] = if m { 255 } else { 0 });
+        image
+    };
+    Ok(views.iter().map(shown).collect())
+}
+
+#[test]
+fn what_the_other_views_show_mends_masks() {
+    let (mut views, truth) = scene();
+    // Print in the table's colour, in four photos.
+    for (view, mask) in views.iter_mut().zip(&truth).step_by(2) {
+        let width = W as usize;
+        let inside: Vec<(usize, usize)> =
+            (0..mask.len()).filter(|i| mask[*i]).map(|i| (i % width, i / width)).collect();
+        let middle = |f: fn(&(usize, usize)) -> usize| inside.iter().map(f).sum::<usize>() / inside.len();
+        let (x0, y0) = (middle(|p| p.0), middle(|p| p.1));
+        let lowest = inside.iter().max_by_key(|p| p.1).unwrap();
+        let table = *view.image.get_pixel(lowest.0 as u32, lowest.1 as u32 + 4);
+        for (x, y) in inside.iter().filter(|(x, y)| x.abs_diff(x0) < 10 && y.abs_diff(y0) < 10) {
+            view.image.put_pixel(*x as u32, *y as u32, table);
+        }
+    }
+    let shares = |others| {
+        let found = masks(&views, &Hints { others, ..Hints::default() }).unwrap();
+        found.alpha.iter().zip(&truth).map(|(a, t)| overlap(&solid(a), t)).collect::<Vec<f64>>()
+    };
+    let (before, after) = (shares(None), shares(Some(truth_shown as OthersShow)));
+    // Three of them are filled by colours and outlines alone.
+    assert!(before.iter().any(|s| *s < 0.95), "{before:?}");
+    assert!(after.iter().all(|s| *s > 0.98), "{before:?} {after:?}");
+}
+
+#[test]
+fn masks_stay_as_they_are_where_other_views_show_nothing() {
+    let (views, _) = scene();
+    let of = |views: &[View], others| masks(views, &Hints { others, ..Hints::default() }).unwrap();
+    let plain = of(&views, None);
+    let fails: OthersShow = |_| Err("it is dark".into());
+    let small: OthersShow = |views| Ok(vec![RgbaImage::new(3, 2); views.len()]);
+    let fewer: OthersShow = |views| Ok(views[1..].iter().map(|v| v.image.clone()).collect());
+    for (others, words) in [(fails, "it is dark"), (small, "expected 8 pictures"), (fewer, "expected 8 pictures")] {
+        let found = of(&views, Some(others));
+        assert_eq!(found.alpha, plain.alpha);
+        let told: Vec<&String> = found.notes.iter().filter(|n| !plain.notes.contains(n)).collect();
+        assert!(told.len() == 1 && told[0].contains(words), "{told:?}");
+    }
+    // Too few for the others to know anything: they are not asked.
+    let never: OthersShow = |_| panic!("asked");
+    assert_eq!(of(&views[..4], Some(never)).alpha, of(&views[..4], None).alpha);
+}
+
 fn refused(views: &[View], words: &[&str]) {
     let text = match masks(views, &Hints::default()) {
         Err(e @ SceneError::NotCutOut { .. }) => e.to_string(),

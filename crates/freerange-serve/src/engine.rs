@@ -1,6 +1,7 @@
 use std::ops::ControlFlow;
 
 use freerange_camera::{Camera, FrameConfig, View};
+use freerange_scene::estimate::OthersShow;
 use freerange_splat::Cloud;
 use image::RgbaImage;
 use serde::{Deserialize, Serialize};
@@ -15,6 +16,9 @@ pub trait Engine: Send + Sync + 'static {
     /// # Errors
     /// A sentence for the user, where the cameras do not allow a choice.
     fn choose(&self, views: &[View]) -> Result<Vec<usize>, String>;
+
+    /// What masks that are estimated are mended with; none: they are not.
+    fn others_show(&self) -> Option<OthersShow>;
 
     /// Reconstructs. `tell` hears of every step, and ends the work by `ControlFlow::Break`.
     ///

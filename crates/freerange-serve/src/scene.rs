@@ -10,6 +10,7 @@ use freerange_camera::{CameraError, FrameConfig, Similarity, Up, View, canonical
 use freerange_core::write_atomically;
 use freerange_scene::{
     LoadConfig, Loaded, MaskSource, SceneError,
+    estimate::Hints,
     inspect::{inspect, sheet},
     load,
     read::{Cameras, Turntable, cameras},
@@ -141,7 +142,7 @@ pub fn prepare(
         masks: options.masks()?,
         invert_masks: options.invert_masks,
         max_side: limits.side,
-        ..LoadConfig::default()
+        hints: Hints { others: engine.others_show(), ..Hints::default() },
     };
     let mut loaded: Loaded = load(&found, &config).map_err(refused)?;
     // What is only compared with has no use here.

@@ -2,9 +2,10 @@
 
 use std::{net::IpAddr, ops::ControlFlow, path::PathBuf, process::Command, sync::Arc, time::Duration};
 
-use freerange::{Camera, Cloud, Reconstructor, Stage, View, choose_views, pictures::render_view};
+use freerange::{Camera, Cloud, Reconstructor, Stage, View, choose_views, others_show, pictures::render_view};
 use freerange_camera::image_ops::to_picture;
 use freerange_core::IoError;
+use freerange_scene::estimate::OthersShow;
 use freerange_serve::{
     Engine, EngineError, Example, JobOptions, Limits, Outcome, Scene, ServeConfig, ServeError, Server, Start, Step,
 };
@@ -163,6 +164,10 @@ impl Engine for Local {
 
     fn choose(&self, views: &[View]) -> Result<Vec<usize>, String> {
         choose_views(views, self.model.views()).map_err(|e| e.to_string())
+    }
+
+    fn others_show(&self) -> Option<OthersShow> {
+        Some(others_show)
     }
 
     fn run(

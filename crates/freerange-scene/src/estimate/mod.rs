@@ -3,8 +3,10 @@
 //! What is used, in short: the cameras look at the object, so that their axes meet in it (Campbell et al. 2010); what lies at the borders
 //! of the photos is not the object; objects stand on something flat, whose look is known from the views that see past the object
 //! (`plane`); colours of object and background are mixtures of Gaussians, common to all views, and each view is cut at least cost
-//! (GrabCut, Rother et al. 2004); what no other view confirms is not the object (`hull`). These take turns until nothing changes. Work
-//! is done on small pictures, and only the outline is cut again on larger ones.
+//! (GrabCut, Rother et al. 2004); what no other view confirms is not the object (`hull`). These take turns until nothing changes. Then,
+//! where there is something that makes Gaussians of views ([`OthersShow`]), each mask is mended with what all the others make of its view:
+//! print in the table's colour, a foot in its own shadow, the opening of a handle. Work is done on small pictures, and only the outline is
+//! cut again on larger ones.
 
 mod evidence;
 mod hull;
@@ -17,7 +19,7 @@ pub use evidence::{Compared, Evidence};
 pub use hull::overlap;
 
 use crate::SceneError;
-use freerange_camera::{View, cameras_up};
+use freerange_camera::{View, cameras_up, image_ops::resize_area};
 use glam::{DMat3, DVec3, Vec3};
 use hull::{Floor, Hull, reaches_border};
 use image::RgbaImage;
@@ -45,8 +47,18 @@ const INSIDE: f32 = 1.0;
 /// Voxels along the hull's longest side: while masks change, and to judge them.
 const ROUGH: usize = 56;
 const FINE: usize = 120;
-/// Most that is believed of the table: something else may lie there.
+/// Most that is believed of the table: something else may lie there. Less while masks are mended, where others have a say.
 const TRUST: f32 = 0.99;
+const TRUST_MENDING: f32 = 0.5;
+/// Times that masks are mended, and the fewest views of which the others know enough for it.
+const MENDING: usize = 2;
+const LEAST_TO_MEND: usize = 5;
+/// Most that is believed of the colour that the other views show.
+const TRUST_OTHERS: f32 = 0.9;
+/// Their alpha and one less it are raised by this before their ratio counts: log odds of 3 at most.
+const DOUBT: f32 = 0.05;
+/// Log odds against what lies outside of the hull, beside what the other views show.
+const OUTSIDE_MENDING: f32 = 1.0;
 /// Costs are whole numbers: this many to one.
 const UNIT: f32 = 1024.0;
 /// Log density of a colour that nobody has seen before: even over Lab.
@@ -55,9 +67,15 @@ const NOVEL: f32 = -12.9;
 const OBJECT: usize = 5;
 const BACKGROUND: usize = 8;
 
+/// Shows each view as all the others have it, by whatever makes a shape of views: straight colour and alpha, in the order and size of the
+/// views, whose alpha is the masks as they are so far. Or says why not.
+pub type OthersShow = fn(&[View]) -> Result<Vec<RgbaImage>, String>;
+
 /// What is known beforehand.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Hints {
+    /// What masks are mended with; none: they are not.
+    pub others: Option<OthersShow>,
     /// The object's middle, in the world.
     pub center: Option<DVec3>,
     /// The radius of a sphere about it that holds the object.
@@ -133,7 +151,20 @@ pub fn unjudged(views: &[View], hints: &Hints) -> Result<Estimate, SceneError> {
         )),
         None => notes.push("no plane beneath the object stands out: masks rest on colours and outlines alone".into()),
     }
-    let small = stage.take_turns()?;
+    let mut small = stage.take_turns()?;
+    // Poses are judged by what photos say themselves.
+    let evidence = stage.evidence(&small);
+    if let Some(others) = hints.others.filter(|_| views.len() >= LEAST_TO_MEND) {
+        for _ in 0..MENDING {
+            match stage.shown_by_others(views, &small, others) {
+                Ok(shown) => small = stage.mend(&small, shown)?,
+                Err(reason) => {
+                    notes.push(format!("masks are not mended with what other views show: {reason}"));
+                    break;
+                }
+            }
+        }
+    }
     let large = stage.sharpen(views, &small)?;
     let hull = Hull::carve(&large.pictures, &large.masks, stage.centre, 1.3 * stage.radius, stage.floor(), 0, FINE);
     let agreement: Vec<f64> = match &hull {
@@ -146,7 +177,6 @@ pub fn unjudged(views: &[View], hints: &Hints) -> Result<Estimate, SceneError> {
             return refuse(format!("nothing in {} differs from what is around the object", view.name));
         }
     }
-    let evidence = stage.evidence(&small);
     let alpha = views
         .iter()
         .zip(large.pictures.iter().zip(&large.masks))
@@ -178,6 +208,38 @@ struct Masks {
     background: Mixture,
     /// The hull's outlines, `[h, w]`.
     outlines: Vec<Vec<bool>>,
+    /// What the other views show of each, as it is wanted for small and for large pictures; empty before masks are mended.
+    shown: Vec<[Shown; 2]>,
+}
+
+/// A view as the others have it.
+struct Shown {
+    /// `[h, w]`
+    alpha: Vec<f32>,
+    /// `[h, w]`, Lab
+    colour: Vec<Vec3>,
+    /// How far colours may differ from it and still be the object's (Lab).
+    scale: f32,
+}
+
+impl Shown {
+    fn of(image: &RgbaImage, scale: f32) -> Self {
+        Self {
+            alpha: image.pixels().map(|p| f32::from(p[3]) / 255.0).collect(),
+            colour: image.pixels().map(|p| picture::lab([p[0], p[1], p[2]])).collect(),
+            scale,
+        }
+    }
+
+    /// Log odds for the object by what is there alone.
+    fn odds(&self, k: usize) -> f32 {
+        ((self.alpha[k] + DOUBT) / (1.0 - self.alpha[k] + DOUBT)).ln()
+    }
+}
+
+/// How likely a colour is that is so far from the one expected: a density in three dimensions that falls exponentially, its logarithm.
+fn log_likely(off: f32, scale: f32) -> f32 {
+    -2.0 * off / scale - (std::f32::consts::PI * scale.powi(3)).ln()
 }
 
 /// Masks on larger pictures.
@@ -286,18 +348,13 @@ impl Stage {
             let cut: Vec<(Vec<bool>, f64)> = (0..count)
                 .into_par_iter()
                 .map(|i| {
-                    let picture = &self.pictures[i];
-                    let odds = odds(picture, &object, &behind, tables[i].as_ref(), |_| true);
-                    let mut biased = odds.clone();
-                    for (k, o) in biased.iter_mut().enumerate() {
-                        if let Some(last) = &last {
-                            *o += if last.outlines[i][k] { INSIDE } else { -OUTSIDE };
-                        }
-                        if near[i][k] > 1.3 || !picture.valid[k] {
-                            *o = -50.0;
-                        }
-                    }
-                    let mask = tidy(&cut(picture, &biased, None), &odds, picture);
+                    let odds = odds(&self.pictures[i], &object, &behind, tables[i].as_ref(), None, |_| true);
+                    let biased = |k: usize| match &last {
+                        Some(last) if last.outlines[i][k] => odds[k] + INSIDE,
+                        Some(_) => odds[k] - OUTSIDE,
+                        None => odds[k],
+                    };
+                    let mask = self.cut(i, &near[i], &odds, biased);
                     let about = (0..mask.len()).filter(|k| near[i][*k] < 1.0);
                     let (right, all) = about.fold((0usize, 0usize), |(right, all), k| {
                         (right + usize::from(mask[k] == (odds[k] > 0.0)), all + 1)
@@ -306,31 +363,100 @@ impl Stage {
                 })
                 .collect();
             let (masks, clearness): (Vec<Vec<bool>>, Vec<f64>) = cut.into_iter().unzip();
-            let missing = usize::from(count >= 6);
-            let hull =
-                Hull::carve(&self.pictures, &masks, self.centre, 1.3 * self.radius, self.floor(), missing, ROUGH);
-            let Some(hull) = hull else {
-                let reason =
+            let outlines = self.outlines(&masks).ok_or_else(|| SceneError::NotCutOut {
+                reason:
                     "no point of space lies within the masks of all views: the poses may be wrong, or the object moved"
-                        .into();
-                return Err(SceneError::NotCutOut { reason });
-            };
-            let outlines: Vec<Vec<bool>> =
-                self.pictures.par_iter().map(|p| grown(&hull.outline(p), p.width(), p.height(), 2)).collect();
-            background = masks
-                .iter()
-                .zip(&self.pictures)
-                .map(|(m, p)| smooth(m, p.width(), p.height()).iter().map(|v| (1.0 - v).clamp(0.03, 1.0)).collect())
-                .collect();
+                        .into(),
+            })?;
+            background = self.background(&masks);
             let change = last.as_ref().map_or(1.0, |l| {
                 l.masks.iter().zip(&masks).map(|(a, b)| 1.0 - overlap(a, b)).sum::<f64>() / count as f64
             });
-            last = Some(Masks { masks, clearness, object, background: behind, outlines });
+            last = Some(Masks { masks, clearness, object, background: behind, outlines, shown: Vec::new() });
             if change < SETTLED {
                 break;
             }
         }
         last.ok_or_else(|| SceneError::NotCutOut { reason: "no turns".into() })
+    }
+
+    /// The small picture `i` cut at these log odds, tidied by what colours alone say.
+    fn cut(&self, i: usize, near: &[f32], odds: &[f32], biased: impl Fn(usize) -> f32) -> Vec<bool> {
+        let picture = &self.pictures[i];
+        let beyond = |k: usize| near[k] > 1.3 || !picture.valid[k];
+        let biased: Vec<f32> = (0..odds.len()).map(|k| if beyond(k) { -50.0 } else { biased(k) }).collect();
+        tidy(&cut(picture, &biased, None), odds, picture)
+    }
+
+    /// Where the hull of small masks appears in each picture, and a little around it.
+    fn outlines(&self, masks: &[Vec<bool>]) -> Option<Vec<Vec<bool>>> {
+        let missing = usize::from(masks.len() >= 6);
+        let hull = Hull::carve(&self.pictures, masks, self.centre, 1.3 * self.radius, self.floor(), missing, ROUGH)?;
+        Some(self.pictures.par_iter().map(|p| grown(&hull.outline(p), p.width(), p.height(), 2)).collect())
+    }
+
+    /// How likely each pixel of each small picture is not the object.
+    fn background(&self, masks: &[Vec<bool>]) -> Vec<Vec<f32>> {
+        let of = |(m, p): (&Vec<bool>, &Picture)| {
+            smooth(m, p.width(), p.height()).iter().map(|v| (1.0 - v).clamp(0.03, 1.0)).collect()
+        };
+        masks.iter().zip(&self.pictures).map(of).collect()
+    }
+
+    /// Each view as the others have it, on a larger picture.
+    fn shown_by_others(&self, views: &[View], last: &Masks, show: OthersShow) -> Result<Vec<RgbaImage>, String> {
+        let cut_out: Vec<View> = (0..views.len())
+            .map(|i| {
+                let (picture, mut view) = (&self.pictures[i], picture::shrunk(&views[i], LARGE));
+                let (w, h) = (view.camera.width as usize, view.camera.height as usize);
+                let mask = smooth(&last.masks[i], picture.width(), picture.height());
+                let alpha = enlarged(&mask, picture.width(), picture.height(), w, h);
+                view.image.pixels_mut().zip(alpha).for_each(|(p, a)| p[3] = (255.0 * a).round() as u8);
+                view
+            })
+            .collect();
+        let shown = show(&cut_out)?;
+        let fits = |(image, view): (&RgbaImage, &View)| image.dimensions() == view.image.dimensions();
+        match shown.len() == views.len() && shown.iter().zip(&cut_out).all(fits) {
+            true => Ok(shown),
+            false => Err(format!("expected {} pictures of the views' sizes, found others", views.len())),
+        }
+    }
+
+    /// Cuts all views once more, with what the other views show of each.
+    fn mend(&self, last: &Masks, shown: Vec<RgbaImage>) -> Result<Masks, SceneError> {
+        let count = self.pictures.len();
+        let near: Vec<Vec<f32>> = (0..count).map(|i| self.nearness(i)).collect();
+        let background = self.background(&last.masks);
+        let tables: Vec<Option<Table>> = (0..count).map(|i| self.table(&background, i)).collect();
+        let (object, behind) = self.colours(&near, &tables, Some(last))?;
+        let shown: Vec<[Shown; 2]> = (0..count)
+            .map(|i| {
+                let picture = &self.pictures[i];
+                let small = resize_area(&shown[i], picture.camera.width, picture.camera.height);
+                let mut small = Shown::of(&small, 0.0);
+                let sure = (0..small.alpha.len()).filter(|k| small.alpha[*k] > 0.9 && last.masks[i][*k]);
+                let mut off: Vec<f32> = sure.map(|k| picture.smooth[k].distance(small.colour[k])).collect();
+                off.sort_by(f32::total_cmp);
+                // Where they show nothing, any colour may be expected.
+                small.scale = 2.0 + 1.5 * off.get(off.len() / 2).copied().unwrap_or(20.0);
+                let large = Shown::of(&shown[i], small.scale);
+                [small, large]
+            })
+            .collect();
+        let masks: Vec<Vec<bool>> = (0..count)
+            .into_par_iter()
+            .map(|i| {
+                let [shown, _] = &shown[i];
+                let odds = odds(&self.pictures[i], &object, &behind, tables[i].as_ref(), Some(shown), |_| true);
+                let outside = |k: usize| if last.outlines[i][k] { 0.0 } else { OUTSIDE_MENDING };
+                self.cut(i, &near[i], &odds, |k| odds[k] + shown.odds(k) - outside(k))
+            })
+            .collect();
+        let outlines = self.outlines(&masks).ok_or_else(|| SceneError::NotCutOut {
+            reason: "no point of space lies within all masks once they are mended with what other views show".into(),
+        })?;
+        Ok(Masks { masks, clearness: last.clearness.clone(), object, background: behind, outlines, shown })
     }
 
     /// Colours of the object and of the rest, from the last masks or from where the cameras look.
@@ -407,13 +533,19 @@ impl Stage {
                     .plane
                     .as_ref()
                     .map(|plane| plane::table(&pictures, &background, i, self.centre, plane, self.distance, open));
-                let odds = odds(picture, &small.object, &small.background, table.as_ref(), open);
+                let shown = small.shown.get(i).map(|[_, large]| large);
+                let odds = odds(picture, &small.object, &small.background, table.as_ref(), shown, open);
                 let outline: Vec<f32> = small.outlines[i].iter().map(|m| f32::from(u8::from(*m))).collect();
                 let from = &self.pictures[i];
                 let outline = enlarged(&outline, from.width(), from.height(), w, h);
                 let mut biased = odds.clone();
                 for (k, o) in biased.iter_mut().enumerate() {
-                    *o += if outline[k] > 0.5 { INSIDE } else { -OUTSIDE };
+                    let inside = outline[k] > 0.5;
+                    *o += match shown {
+                        Some(shown) => shown.odds(k) - if inside { 0.0 } else { OUTSIDE_MENDING },
+                        None if inside => INSIDE,
+                        None => -OUTSIDE,
+                    };
                 }
                 let mask = cut(picture, &biased, Some((&inner, &outer)));
                 tidy(&mask, &odds, picture)
@@ -445,6 +577,7 @@ fn odds(
     object: &Mixture,
     behind: &Mixture,
     table: Option<&Table>,
+    shown: Option<&Shown>,
     wanted: impl Fn(usize) -> bool,
 ) -> Vec<f32> {
     (0..picture.lab.len())
@@ -458,13 +591,20 @@ fn odds(
             let own = log_add(log_add(object.log_density(colour) - 0.16, NOVEL - 2.3), rest - 3.0);
             let rest = match table {
                 Some(table) if table.trust[k] > 0.0 => {
-                    let (trust, scale) = (TRUST * table.trust[k], table.scale[k]);
+                    let most = if shown.is_some() { TRUST_MENDING } else { TRUST };
+                    let (trust, scale) = (most * table.trust[k], table.scale[k]);
                     let off = picture.smooth[k].distance(table.colour[k]);
-                    // A density in three dimensions that falls exponentially.
-                    let seen = -2.0 * off / scale - (std::f32::consts::PI * scale.powi(3)).ln();
-                    log_add(trust.ln() + seen, (1.0 - trust).ln() + rest)
+                    log_add(trust.ln() + log_likely(off, scale), (1.0 - trust).ln() + rest)
                 }
                 _ => rest,
+            };
+            let own = match shown {
+                Some(shown) if shown.alpha[k] > 0.0 => {
+                    let trust = TRUST_OTHERS * shown.alpha[k];
+                    let off = picture.smooth[k].distance(shown.colour[k]);
+                    log_add(trust.ln() + log_likely(off, shown.scale), (1.0 - trust).ln() + own)
+                }
+                _ => own,
             };
             (own - rest).clamp(-MOST, MOST)
         })

@@ -24,13 +24,8 @@ pub struct Picture {
 impl Picture {
     /// The view with its longer side at most `side` pixels.
     pub fn of(view: &View, side: u32) -> Self {
-        let (w, h) = view.image.dimensions();
-        let longer = w.max(h);
-        let small =
-            |s: u32| ((u64::from(s) * u64::from(side) + u64::from(longer) / 2) / u64::from(longer)).max(1) as u32;
-        let (nw, nh) = if longer > side { (small(w), small(h)) } else { (w, h) };
-        let image = resize_area(&view.image, nw, nh);
-        let camera = view.camera.resized(nw, nh);
+        let View { camera, image, .. } = shrunk(view, side);
+        let (nw, nh) = image.dimensions();
         let lab: Vec<Vec3> = image.pixels().map(|p| lab([p[0], p[1], p[2]])).collect();
         let valid = image.pixels().map(|p| p[3] >= 128).collect();
         let (w, h) = (nw as usize, nh as usize);
@@ -73,6 +68,15 @@ impl Picture {
         let p: DVec4 = c.world_to_camera * point.extend(1.0);
         (c.fx * p.x / p.z + c.cx, c.fy * p.y / p.z + c.cy, p.z)
     }
+}
+
+/// The view with its longer side at most `side` pixels.
+pub fn shrunk(view: &View, side: u32) -> View {
+    let (w, h) = view.image.dimensions();
+    let longer = w.max(h);
+    let small = |s: u32| ((u64::from(s) * u64::from(side) + u64::from(longer) / 2) / u64::from(longer)).max(1) as u32;
+    let (w, h) = if longer > side { (small(w), small(h)) } else { (w, h) };
+    View { name: view.name.clone(), camera: view.camera.resized(w, h), image: resize_area(&view.image, w, h) }
 }
 
 fn neighbour(x: usize, y: usize, dx: i32, dy: i32, w: usize, h: usize) -> Option<usize> {

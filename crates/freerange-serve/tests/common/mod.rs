@@ -16,6 +16,7 @@ use std::{
 };
 
 use freerange_camera::{Camera, View};
+use freerange_scene::estimate::OthersShow;
 use freerange_serve::{Engine, EngineError, Example, JobOptions, Outcome, Scene, ServeConfig, Server, Step, Stopper};
 use freerange_splat::{Cloud, channel};
 use image::RgbaImage;
@@ -80,6 +81,10 @@ impl Engine for Fake {
 
     fn choose(&self, views: &[View]) -> Result<Vec<usize>, String> {
         Ok((0..views.len()).collect())
+    }
+
+    fn others_show(&self) -> Option<OthersShow> {
+        None
     }
 
     fn run(
