@@ -129,7 +129,6 @@ fn the_same_photos_give_the_same_masks() {
     assert_eq!((a.alpha, a.agreement), (b.alpha, b.agreement));
 }
 
-#[track_caller]
 /// What the others would show, were they to know all: where the object is, and the colour that it has there.
 fn truth_shown(views: &[View]) -> Result<Vec<RgbaImage>, String> {
     let shown = |v: &View| {
@@ -185,6 +184,7 @@ fn masks_stay_as_they_are_where_other_views_show_nothing() {
     assert_eq!(of(&views[..4], Some(never)).alpha, of(&views[..4], None).alpha);
 }
 
+#[track_caller]
 fn refused(views: &[View], words: &[&str]) {
     let text = match masks(views, &Hints::default()) {
         Err(e @ SceneError::NotCutOut { .. }) => e.to_string(),
