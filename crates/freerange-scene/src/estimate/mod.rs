@@ -41,9 +41,17 @@ const SMOOTHNESS: f32 = 40.0;
 /// No pixel's log odds count for more.
 const MOST: f32 = 6.0;
 /// Log odds against what lies outside of the other views' hull.
-const OUTSIDE: f32 = 3.0;
+const OUTSIDE: f32 = 5.0;
 /// Log odds for what lies within it.
 const INSIDE: f32 = 1.0;
+/// Parts of a mask, beside its largest, of which less than this share lies within the hull are something else that stands there.
+const WITHIN: f32 = 0.5;
+/// Holes whose mean log odds are less stay open: handles have them. Others are print in the background's colour.
+const OPEN: f32 = -1.0;
+/// How far from where the cameras look, in radii of the sphere about it, the table is not believed before there are masks, and from where it
+/// is. Less, and the foot of what has one colour is taken for a print on the table, on which all views agree.
+const UNSEEN: f32 = 0.7;
+const SEEN: f32 = 0.95;
 /// Voxels along the hull's longest side: while masks change, and to judge them.
 const ROUGH: usize = 56;
 const FINE: usize = 120;
@@ -339,8 +347,10 @@ impl Stage {
     fn take_turns(&self) -> Result<Masks, SceneError> {
         let count = self.pictures.len();
         let near: Vec<Vec<f32>> = (0..count).map(|i| self.nearness(i)).collect();
-        let mut background: Vec<Vec<f32>> =
-            near.iter().map(|n| n.iter().map(|d| ((d - 0.3) / 0.6).clamp(0.07, 1.0)).collect()).collect();
+        let mut background: Vec<Vec<f32>> = near
+            .iter()
+            .map(|n| n.iter().map(|d| ((d - UNSEEN) / (SEEN - UNSEEN)).clamp(0.07, 1.0)).collect())
+            .collect();
         let mut last: Option<Masks> = None;
         for _ in 0..TURNS {
             let tables: Vec<Option<Table>> = (0..count).map(|i| self.table(&background, i)).collect();
@@ -354,7 +364,7 @@ impl Stage {
                         Some(_) => odds[k] - OUTSIDE,
                         None => odds[k],
                     };
-                    let mask = self.cut(i, &near[i], &odds, biased);
+                    let mask = self.cut(i, &near[i], &odds, last.as_ref().map(|l| &l.outlines[i][..]), biased);
                     let about = (0..mask.len()).filter(|k| near[i][*k] < 1.0);
                     let (right, all) = about.fold((0usize, 0usize), |(right, all), k| {
                         (right + usize::from(mask[k] == (odds[k] > 0.0)), all + 1)
@@ -380,12 +390,19 @@ impl Stage {
         last.ok_or_else(|| SceneError::NotCutOut { reason: "no turns".into() })
     }
 
-    /// The small picture `i` cut at these log odds, tidied by what colours alone say.
-    fn cut(&self, i: usize, near: &[f32], odds: &[f32], biased: impl Fn(usize) -> f32) -> Vec<bool> {
+    /// The small picture `i` cut at these log odds, tidied by what colours alone and the hull's outline say.
+    fn cut(
+        &self,
+        i: usize,
+        near: &[f32],
+        odds: &[f32],
+        outline: Option<&[bool]>,
+        biased: impl Fn(usize) -> f32,
+    ) -> Vec<bool> {
         let picture = &self.pictures[i];
         let beyond = |k: usize| near[k] > 1.3 || !picture.valid[k];
         let biased: Vec<f32> = (0..odds.len()).map(|k| if beyond(k) { -50.0 } else { biased(k) }).collect();
-        tidy(&cut(picture, &biased, None), odds, picture)
+        tidy(&cut(picture, &biased, None), odds, outline, picture)
     }
 
     /// Where the hull of small masks appears in each picture, and a little around it.
@@ -450,7 +467,7 @@ impl Stage {
                 let [shown, _] = &shown[i];
                 let odds = odds(&self.pictures[i], &object, &behind, tables[i].as_ref(), Some(shown), |_| true);
                 let outside = |k: usize| if last.outlines[i][k] { 0.0 } else { OUTSIDE_MENDING };
-                self.cut(i, &near[i], &odds, |k| odds[k] + shown.odds(k) - outside(k))
+                self.cut(i, &near[i], &odds, Some(&last.outlines[i]), |k| odds[k] + shown.odds(k) - outside(k))
             })
             .collect();
         let outlines = self.outlines(&masks).ok_or_else(|| SceneError::NotCutOut {
@@ -538,17 +555,17 @@ impl Stage {
                 let outline: Vec<f32> = small.outlines[i].iter().map(|m| f32::from(u8::from(*m))).collect();
                 let from = &self.pictures[i];
                 let outline = enlarged(&outline, from.width(), from.height(), w, h);
+                let outline: Vec<bool> = outline.iter().map(|o| *o > 0.5).collect();
                 let mut biased = odds.clone();
                 for (k, o) in biased.iter_mut().enumerate() {
-                    let inside = outline[k] > 0.5;
                     *o += match shown {
-                        Some(shown) => shown.odds(k) - if inside { 0.0 } else { OUTSIDE_MENDING },
-                        None if inside => INSIDE,
+                        Some(shown) => shown.odds(k) - if outline[k] { 0.0 } else { OUTSIDE_MENDING },
+                        None if outline[k] => INSIDE,
                         None => -OUTSIDE,
                     };
                 }
                 let mask = cut(picture, &biased, Some((&inner, &outer)));
-                tidy(&mask, &odds, picture)
+                tidy(&mask, &odds, Some(&outline), picture)
             })
             .collect();
         Ok(Sharp { pictures, masks })
@@ -630,20 +647,24 @@ fn cut(picture: &Picture, odds: &[f32], bounds: Option<(&[bool], &[bool])>) -> V
     grid.cut()
 }
 
-/// Fills holes that are not clearly background, and drops parts that are small beside the largest.
-fn tidy(mask: &[bool], odds: &[f32], picture: &Picture) -> Vec<bool> {
+/// Fills holes that are not background, and drops parts that are small beside the largest or that lie outside of `outline`, where the hull
+/// appears.
+fn tidy(mask: &[bool], odds: &[f32], outline: Option<&[bool]>, picture: &Picture) -> Vec<bool> {
     let (w, h) = (picture.width(), picture.height());
     let mut out = mask.to_vec();
     let holes = parts(mask, false, w, h);
     for hole in holes.iter().filter(|p| !p.iter().any(|k| k % w == 0 || k % w + 1 == w || *k < w || k + w >= w * h)) {
         let mean = hole.iter().map(|k| odds[*k]).sum::<f32>() / hole.len() as f32;
-        if mean > -2.5 || hole.len() * 2000 < w * h {
+        if mean > OPEN || hole.len() * 2000 < w * h {
             hole.iter().for_each(|k| out[*k] = true);
         }
     }
     let pieces = parts(&out, true, w, h);
     let largest = pieces.iter().map(Vec::len).max().unwrap_or(0);
-    for piece in pieces.iter().filter(|p| p.len() * 10 < largest) {
+    let elsewhere = |piece: &[usize]| {
+        outline.is_some_and(|o| (piece.iter().filter(|k| o[**k]).count() as f32) < WITHIN * piece.len() as f32)
+    };
+    for piece in pieces.iter().filter(|p| p.len() < largest && (p.len() * 10 < largest || elsewhere(p))) {
         piece.iter().for_each(|k| out[*k] = false);
     }
     out
