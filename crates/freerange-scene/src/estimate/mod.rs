@@ -11,19 +11,22 @@
 mod evidence;
 mod hull;
 mod maxflow;
+mod mend;
 mod mixture;
 mod picture;
 mod plane;
 
 pub use evidence::{Compared, Evidence};
 pub use hull::overlap;
+pub use mend::OthersShow;
 
 use crate::SceneError;
-use freerange_camera::{View, cameras_up, image_ops::resize_area};
+use freerange_camera::{View, cameras_up};
 use glam::{DMat3, DVec3, Vec3};
 use hull::{Floor, Hull, reaches_border};
 use image::RgbaImage;
 use maxflow::Grid;
+use mend::{LEAST_TO_MEND, MENDING, OUTSIDE_MENDING, Shown};
 use mixture::Mixture;
 use picture::{Picture, STEPS, bilinear};
 use plane::{Plane, Table};
@@ -58,15 +61,8 @@ const FINE: usize = 120;
 /// Most that is believed of the table: something else may lie there. Less while masks are mended, where others have a say.
 const TRUST: f32 = 0.99;
 const TRUST_MENDING: f32 = 0.5;
-/// Times that masks are mended, and the fewest views of which the others know enough for it.
-const MENDING: usize = 2;
-const LEAST_TO_MEND: usize = 5;
 /// Most that is believed of the colour that the other views show.
 const TRUST_OTHERS: f32 = 0.9;
-/// Their alpha and one less it are raised by this before their ratio counts: log odds of 3 at most.
-const DOUBT: f32 = 0.05;
-/// Log odds against what lies outside of the hull, beside what the other views show.
-const OUTSIDE_MENDING: f32 = 1.0;
 /// Costs are whole numbers: this many to one.
 const UNIT: f32 = 1024.0;
 /// Log density of a colour that nobody has seen before: even over Lab.
@@ -74,10 +70,6 @@ const NOVEL: f32 = -12.9;
 /// Components of the mixtures.
 const OBJECT: usize = 5;
 const BACKGROUND: usize = 8;
-
-/// Shows each view as all the others have it, by whatever makes a shape of views: straight colour and alpha, in the order and size of the
-/// views, whose alpha is the masks as they are so far. Or says why not.
-pub type OthersShow = fn(&[View]) -> Result<Vec<RgbaImage>, String>;
 
 /// What is known beforehand.
 #[derive(Clone, Copy, Debug, Default)]
@@ -218,31 +210,6 @@ struct Masks {
     outlines: Vec<Vec<bool>>,
     /// What the other views show of each, as it is wanted for small and for large pictures; empty before masks are mended.
     shown: Vec<[Shown; 2]>,
-}
-
-/// A view as the others have it.
-struct Shown {
-    /// `[h, w]`
-    alpha: Vec<f32>,
-    /// `[h, w]`, Lab
-    colour: Vec<Vec3>,
-    /// How far colours may differ from it and still be the object's (Lab).
-    scale: f32,
-}
-
-impl Shown {
-    fn of(image: &RgbaImage, scale: f32) -> Self {
-        Self {
-            alpha: image.pixels().map(|p| f32::from(p[3]) / 255.0).collect(),
-            colour: image.pixels().map(|p| picture::lab([p[0], p[1], p[2]])).collect(),
-            scale,
-        }
-    }
-
-    /// Log odds for the object by what is there alone.
-    fn odds(&self, k: usize) -> f32 {
-        ((self.alpha[k] + DOUBT) / (1.0 - self.alpha[k] + DOUBT)).ln()
-    }
 }
 
 /// How likely a colour is that is so far from the one expected: a density in three dimensions that falls exponentially, its logarithm.
@@ -418,62 +385,6 @@ impl Stage {
             smooth(m, p.width(), p.height()).iter().map(|v| (1.0 - v).clamp(0.03, 1.0)).collect()
         };
         masks.iter().zip(&self.pictures).map(of).collect()
-    }
-
-    /// Each view as the others have it, on a larger picture.
-    fn shown_by_others(&self, views: &[View], last: &Masks, show: OthersShow) -> Result<Vec<RgbaImage>, String> {
-        let cut_out: Vec<View> = (0..views.len())
-            .map(|i| {
-                let (picture, mut view) = (&self.pictures[i], picture::shrunk(&views[i], LARGE));
-                let (w, h) = (view.camera.width as usize, view.camera.height as usize);
-                let mask = smooth(&last.masks[i], picture.width(), picture.height());
-                let alpha = enlarged(&mask, picture.width(), picture.height(), w, h);
-                view.image.pixels_mut().zip(alpha).for_each(|(p, a)| p[3] = (255.0 * a).round() as u8);
-                view
-            })
-            .collect();
-        let shown = show(&cut_out)?;
-        let fits = |(image, view): (&RgbaImage, &View)| image.dimensions() == view.image.dimensions();
-        match shown.len() == views.len() && shown.iter().zip(&cut_out).all(fits) {
-            true => Ok(shown),
-            false => Err(format!("expected {} pictures of the views' sizes, found others", views.len())),
-        }
-    }
-
-    /// Cuts all views once more, with what the other views show of each.
-    fn mend(&self, last: &Masks, shown: Vec<RgbaImage>) -> Result<Masks, SceneError> {
-        let count = self.pictures.len();
-        let near: Vec<Vec<f32>> = (0..count).map(|i| self.nearness(i)).collect();
-        let background = self.background(&last.masks);
-        let tables: Vec<Option<Table>> = (0..count).map(|i| self.table(&background, i)).collect();
-        let (object, behind) = self.colours(&near, &tables, Some(last))?;
-        let shown: Vec<[Shown; 2]> = (0..count)
-            .map(|i| {
-                let picture = &self.pictures[i];
-                let small = resize_area(&shown[i], picture.camera.width, picture.camera.height);
-                let mut small = Shown::of(&small, 0.0);
-                let sure = (0..small.alpha.len()).filter(|k| small.alpha[*k] > 0.9 && last.masks[i][*k]);
-                let mut off: Vec<f32> = sure.map(|k| picture.smooth[k].distance(small.colour[k])).collect();
-                off.sort_by(f32::total_cmp);
-                // Where they show nothing, any colour may be expected.
-                small.scale = 2.0 + 1.5 * off.get(off.len() / 2).copied().unwrap_or(20.0);
-                let large = Shown::of(&shown[i], small.scale);
-                [small, large]
-            })
-            .collect();
-        let masks: Vec<Vec<bool>> = (0..count)
-            .into_par_iter()
-            .map(|i| {
-                let [shown, _] = &shown[i];
-                let odds = odds(&self.pictures[i], &object, &behind, tables[i].as_ref(), Some(shown), |_| true);
-                let outside = |k: usize| if last.outlines[i][k] { 0.0 } else { OUTSIDE_MENDING };
-                self.cut(i, &near[i], &odds, Some(&last.outlines[i]), |k| odds[k] + shown.odds(k) - outside(k))
-            })
-            .collect();
-        let outlines = self.outlines(&masks).ok_or_else(|| SceneError::NotCutOut {
-            reason: "no point of space lies within all masks once they are mended with what other views show".into(),
-        })?;
-        Ok(Masks { masks, clearness: last.clearness.clone(), object, background: behind, outlines, shown })
     }
 
     /// Colours of the object and of the rest, from the last masks or from where the cameras look.
