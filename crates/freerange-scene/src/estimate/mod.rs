@@ -656,12 +656,12 @@ fn enlarged(values: &[f32], w: usize, h: usize, nw: usize, nh: usize) -> Vec<f32
     (0..nw * nh).map(|k| bilinear(values, w, h, ((k % nw) as f64 + 0.5) * sx, ((k / nw) as f64 + 0.5) * sy)).collect()
 }
 
-/// The mask as an alpha channel of this size, with an edge about a pixel wide.
+/// The mask as an alpha channel of this size, with an edge at most a pixel wide: wider ones cost fits of small photos a quarter of a dB.
 fn soft(mask: &[bool], picture: &Picture, size: (u32, u32)) -> Vec<u8> {
     let (w, h) = (picture.width(), picture.height());
     let values = enlarged(&smooth(mask, w, h), w, h, size.0 as usize, size.1 as usize);
-    // Enlarged edges are as much wider as the picture is.
-    let slope = (f64::from(size.0) / w as f64).max(1.0) as f32;
+    // Blurred edges are two pixels wide, enlarged ones as much wider as the picture is.
+    let slope = 2.0 * (f64::from(size.0) / w as f64).max(1.0) as f32;
     values.iter().map(|v| ((slope * (v - 0.5) + 0.5).clamp(0.0, 1.0) * 255.0).round() as u8).collect()
 }
 
