@@ -1,8 +1,9 @@
 //! Masks mended with what the other views show: a quick fit of all the others says where the object is in a view, and in which colour.
 
+use super::mask::{enlarged, smooth};
 use super::picture;
 use super::plane::Table;
-use super::{LARGE, Masks, Stage, enlarged, odds, smooth};
+use super::{LARGE, Masks, Stage, odds};
 use crate::SceneError;
 use freerange_camera::{View, image_ops::resize_area};
 use glam::Vec3;
