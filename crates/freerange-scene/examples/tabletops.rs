@@ -1,9 +1,9 @@
 //! Photos of generated objects on tables, as folders like those of a user, with the truth beside them: what is measured in dB for photos is
 //! chosen on these.
 //!
-//! `cargo run --release -p freerange-scene --example tabletops -- FIRST_SEED SCENES OUT`, then `python tools/photos.py OUT RESULTS`. In each
-//! folder eight photos with their cameras (`transforms.json`), their true masks (`truth/masks`), and eight other views of the object alone
-//! (`transforms_val.json`). Scenes in which a border cuts the object, or whose photos are of two shapes, are left out.
+//! `cargo run --release -p freerange-scene --example tabletops -- FIRST_SEED SCENES OUT [PHOTOS]`, then `python tools/photos.py OUT RESULTS`. In
+//! each folder eight photos (or PHOTOS) with their cameras (`transforms.json`), their true masks (`truth/masks`), and as many other views of
+//! the object alone (`transforms_val.json`). Scenes in which a border cuts the object, or whose photos are of two shapes, are left out.
 
 use std::{error::Error, f64::consts::TAU, fs, path::Path};
 
@@ -13,18 +13,21 @@ use image::{GrayImage, Luma, RgbaImage};
 #[path = "../tests/tabletop/mod.rs"]
 mod tabletop;
 
-/// Every other one is a photo, the rest is to compare with.
-const CAMERAS: usize = 16;
-
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let [first, scenes, out] = arguments.as_slice() else { return Err("expected FIRST_SEED SCENES OUT".into()) };
+    let (first, scenes, out, photos) = match arguments.as_slice() {
+        [first, scenes, out] => (first, scenes, out, 8),
+        [first, scenes, out, photos] => (first, scenes, out, photos.parse()?),
+        _ => return Err("expected FIRST_SEED SCENES OUT [PHOTOS]".into()),
+    };
     let (first, scenes): (u64, usize) = (first.parse()?, scenes.parse()?);
+    // Every other one is a photo, the rest is to compare with.
+    let cameras = 2 * photos;
     let mut seeds = first..;
     for _ in 0..scenes {
         let (seed, scene) = seeds
             .by_ref()
-            .map(|seed| (seed, tabletop::tabletop(seed, CAMERAS, TAU, (640, 480))))
+            .map(|seed| (seed, tabletop::tabletop(seed, cameras, TAU, (640, 480))))
             .find(|(_, scene)| scene.alone.iter().all(|i| i.dimensions() == scene.alone[0].dimensions() && whole(i)))
             .ok_or("no more seeds")?;
         let folder = Path::new(out).join(format!("tabletop-{seed}"));

@@ -263,17 +263,19 @@ fn generated_scenes_tell_right_poses_from_wrong_ones() {
 }
 
 /// What is hard about these: a bowl of one colour, whose foot all views see as a print on the table, eight of them or sixteen; the opening
-/// of a handle, before a wall; other objects, some of them touched by the outline.
+/// of a handle, before a wall; other objects, some of them touched by the outline; a pan that lies flat, all but its handle; a wall that
+/// looks like a table far above.
 #[test]
 fn bowls_handles_and_neighbours_are_told_apart() {
-    for (seed, every) in [(504, 2), (504, 1), (3000, 2), (3002, 2)] {
+    let cases = [(504, 2, 0.97), (504, 1, 0.97), (3000, 2, 0.96), (3002, 2, 0.97), (4008, 1, 0.96), (4023, 1, 0.93)];
+    for (seed, every, least) in cases {
         let scene = tabletop::tabletop(seed, 16, std::f64::consts::TAU, (320, 240));
         let views: Vec<View> = scene.views.iter().step_by(every).cloned().collect();
         let found = masks(&views, &Hints::default()).unwrap();
         let truth = scene.alone.iter().step_by(every).map(|i| i.pixels().map(|p| p[3] >= 128).collect::<Vec<_>>());
         let shares: Vec<f64> = found.alpha.iter().zip(truth).map(|(a, t)| overlap(&solid(a), &t)).collect();
         let mean = shares.iter().sum::<f64>() / shares.len() as f64;
-        assert!(mean > 0.96 && shares.iter().all(|s| *s > 0.94), "{seed} {}: {shares:?}", scene.what);
+        assert!(mean > least && shares.iter().all(|s| *s > least - 0.03), "{seed} {}: {shares:?}", scene.what);
     }
 }
 

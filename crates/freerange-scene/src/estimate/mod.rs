@@ -53,6 +53,9 @@ const INSIDE: f32 = 1.0;
 /// is. Less, and the foot of what has one colour is taken for a print on the table, on which all views agree.
 const UNSEEN: f32 = 0.7;
 const SEEN: f32 = 0.95;
+/// Before there are masks, colours that are certainly the object's stand for all of it if they are this share of what lies about where the
+/// cameras look. A handle that stands out is less: what it belongs to may lie flat on the table.
+const SURE: f64 = 0.02;
 /// Voxels along the hull's longest side: while masks change, and to judge them.
 const ROUGH: usize = 56;
 const FINE: usize = 120;
@@ -418,7 +421,8 @@ impl Stage {
                 }
             }
         }
-        if sure.len() * 10 >= object.len() * 3 || (last.is_none() && sure.len() >= 200) {
+        let enough = if last.is_some() { 0.3 } else { SURE };
+        if sure.len() as f64 >= enough * object.len() as f64 {
             object = sure;
         }
         // The table about the object counts as much as all else: its shadows are what objects are mistaken for.

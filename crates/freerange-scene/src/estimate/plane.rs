@@ -10,8 +10,8 @@ use rayon::prelude::*;
 
 /// Colour differences beyond this count as this (Lab).
 const CAP: f32 = 30.0;
-/// Other views that tell a view what is behind the object, at most.
-const OTHERS: usize = 12;
+/// Other views that tell a view what is behind the object, at most. More, and doubts about each of them add up to trust.
+const OTHERS: usize = 7;
 
 /// `normal . (x - centre) = height`, with the normal pointing up.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -44,6 +44,8 @@ pub fn find(
     let score = |p: [f64; 3], grid: usize| {
         disagreement(pictures, object, centre, normal([p[0], p[1]]), p[2] * distance, 0.7 * distance, grid)
     };
+    // Farther away little of a plane is seen, and that little may agree by chance: of walls, for one.
+    let within = |p: [f64; 3]| p[0].hypot(p[1]) < 0.6 && (-0.5..0.15).contains(&p[2]);
     let mut candidates = Vec::new();
     for i in -1..=1 {
         for j in -1..=1 {
@@ -63,7 +65,7 @@ pub fn find(
     }
     let (best, p) = starts
         .par_iter()
-        .map(|start| descend(*start, |p| score(p, 48).unwrap_or(f64::INFINITY)))
+        .map(|start| descend(*start, |p| within(p).then(|| score(p, 48)).flatten().unwrap_or(f64::INFINITY)))
         .min_by(|x, y| x.0.total_cmp(&y.0))?;
     // On the scenes that this was made with: 5 on the table, 17 to 20 elsewhere.
     let plane = Plane { normal: normal([p[0], p[1]]), height: p[2] * distance, disagreement: best };
