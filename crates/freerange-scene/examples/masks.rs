@@ -1,19 +1,25 @@
-//! How good masks from poses and colours are: intersection over union with true masks, for every photo.
+//! How good masks from poses and colours, or a network's, are: intersection over union with true masks, for every photo.
 //!
-//! `masks SCENES [--views N]`: folders as `freerange reconstruct` takes them, each with `truth/masks/NAME.png`, which are only compared
-//! with. `--views N` uses the first N photos only; `--write FOLDER` writes the masks.
+//! `masks SCENES [--views N] [--mask-model FILE.onnx RANGE]`: folders as `freerange reconstruct` takes them, each with `truth/masks/NAME.png`, which are only compared
+//! with. `--views N` uses the first N photos only; `--write FOLDER` writes the masks; `--mask-model`
+//! as in the program (`--features mask-model`).
 
-use freerange_scene::{LoadConfig, MaskSource, estimate::overlap, load, read, write_masks};
+use freerange_scene::{LoadConfig, MaskModel, MaskSource, PixelRange, estimate::overlap, load, read, write_masks};
 use std::{path::Path, time::Instant};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut scenes = Vec::new();
-    let (mut count, mut write) = (usize::MAX, None);
+    let (mut count, mut write, mut masks) = (usize::MAX, None, MaskSource::Estimate);
     let mut args = std::env::args().skip(1);
     while let Some(arg) = args.next() {
         match arg.as_str() {
             "--views" => count = args.next().ok_or("--views N")?.parse()?,
             "--write" => write = args.next(),
+            "--mask-model" => {
+                let (file, range) = args.next().zip(args.next()).ok_or("--mask-model FILE.onnx RANGE")?;
+                let (_, pixels) = PixelRange::ALL.into_iter().find(|(name, _)| *name == range).ok_or("RANGE")?;
+                masks = MaskSource::Model(MaskModel { file: file.into(), pixels });
+            }
             _ => scenes.push(arg),
         }
     }
@@ -23,7 +29,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let mut cameras = read::cameras(scene, None, None)?;
         cameras.photos.truncate(count);
         let begin = Instant::now();
-        let estimated = load(&cameras, &LoadConfig { masks: MaskSource::Estimate, ..LoadConfig::default() });
+        let estimated = load(&cameras, &LoadConfig { masks: masks.clone(), ..LoadConfig::default() });
         let seconds = begin.elapsed().as_secs_f64();
         let estimated = match estimated {
             Ok(estimated) => estimated,

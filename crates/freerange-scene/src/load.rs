@@ -292,6 +292,18 @@ fn mask_all(
             set_alpha(&mut view.image, &alpha);
         }
         notes.push(format!("the object was cut out by {}", model.file.display()));
+        if let Some(confirmed) = estimate::confirmed(views, &config.hints) {
+            let mut names = Vec::new();
+            for (view, keep) in views.iter_mut().zip(confirmed) {
+                if let Some(keep) = keep {
+                    set_alpha(&mut view.image, &keep);
+                    names.push(view.name.clone());
+                }
+            }
+            if !names.is_empty() {
+                notes.push(format!("what only {} marked beside the object was taken away", names.join(", ")));
+            }
+        }
         return Ok((MaskKind::Model, None));
     }
     let auto = config.masks == MaskSource::Auto;

@@ -3,7 +3,7 @@
 use freerange_camera::{Camera, View};
 use freerange_scene::{
     LoadConfig, MaskSource, SceneError,
-    estimate::{Hints, OthersShow, agreement, contradictions, masks, overlap, table_faces},
+    estimate::{Hints, OthersShow, agreement, confirmed, contradictions, masks, overlap, table_faces},
     load,
     read::cameras,
 };
@@ -277,6 +277,41 @@ fn bowls_handles_and_neighbours_are_told_apart() {
         let mean = shares.iter().sum::<f64>() / shares.len() as f64;
         assert!(mean > least && shares.iter().all(|s| *s > least - 0.03), "{seed} {}: {shares:?}", scene.what);
     }
+}
+
+/// True masks, two of which mark something beside the object, as networks that see one photo do.
+#[test]
+fn what_few_masks_mark_is_not_confirmed() {
+    let scene = tabletop::tabletop(4008, 16, std::f64::consts::TAU, (320, 240)); // a pan: its handle is thin
+    let mut views: Vec<View> = scene.views.iter().step_by(2).cloned().collect();
+    for (view, alone) in views.iter_mut().zip(scene.alone.iter().step_by(2)) {
+        view.image.pixels_mut().zip(alone.pixels()).for_each(|(p, a)| p[3] = a[3]);
+    }
+    let truth: Vec<Vec<bool>> = views.iter().map(|v| v.image.pixels().map(|p| p[3] >= 128).collect()).collect();
+    let mark = |view: &mut View, x0: u32, y0: u32, side: u32| {
+        (0..side * side).for_each(|k| view.image.get_pixel_mut(x0 + k % side, y0 + k / side)[3] = 255);
+    };
+    // One apart from the object, one that touches its middle and reaches far beyond it.
+    mark(&mut views[1], 20, 20, 40);
+    let (w, h) = views[4].image.dimensions();
+    mark(&mut views[4], w / 2, h / 2, 60);
+    let kept = |views: &[View]| -> Vec<Vec<bool>> {
+        let found = confirmed(views, &Hints::default()).unwrap();
+        let one = |(view, keep): (&View, Option<Vec<u8>>)| {
+            let own = view.image.pixels().map(|p| p[3] >= 128);
+            match keep {
+                Some(keep) => own.zip(keep).map(|(o, k)| o && k >= 128).collect(),
+                None => own.collect(),
+            }
+        };
+        views.iter().zip(found).map(one).collect()
+    };
+    let marked = views.iter().map(|v| v.image.pixels().map(|p| p[3] >= 128).collect::<Vec<_>>());
+    let before: Vec<f64> = marked.zip(&truth).map(|(a, b)| overlap(&a, b)).collect();
+    assert!(before[1] < 0.75 && before[4] < 0.6, "{before:?}");
+    let shares: Vec<f64> = kept(&views).iter().zip(&truth).map(|(a, b)| overlap(a, b)).collect();
+    assert!(shares.iter().enumerate().all(|(i, s)| *s > if i == 4 { 0.7 } else { 0.97 }), "{shares:?}");
+    assert!(confirmed(&views[..2], &Hints::default()).is_none());
 }
 
 /// Photo-like scenes with true masks.

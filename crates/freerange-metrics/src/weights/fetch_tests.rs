@@ -158,7 +158,7 @@ fn failed_downloads_leave_nothing() {
     let server = Server::start();
     let folder = tempfile::tempdir().unwrap();
     let target = |path: &str, sha256: &'static str| {
-        set_of(vec![WeightFile { path: "a/b.pth", origin: Origin::Url(server.url(path)), sha256 }])
+        set_of(vec![WeightFile { path: "a/b.pth", origin: Origin::Url(server.url(path)), sha256, twin: None }])
     };
     let fetched = |set: &WeightSet| fetch_set(set, folder.path(), &server.options(), &mut quiet);
 
@@ -208,6 +208,7 @@ fn archives_give_only_what_is_wanted() {
         path,
         origin: Origin::Zip { url: server.url(archive), member },
         sha256: "",
+        twin: None,
     };
     let set = set_of(vec![file("x/net.pth.tar", "/all.zip", "net.pth.tar"), file("x/lora/", "/all.zip", "lora/")]);
     let found = fetch_set(&set, &inner, &server.options(), &mut quiet).unwrap();

@@ -35,6 +35,17 @@ pub struct WeightFile {
     /// name). Empty where the authors publish none: what the first download had is then written beside the file, and
     /// holds from then on.
     pub sha256: &'static str,
+    /// What is taken where the published file is not there.
+    pub twin: Option<Twin>,
+}
+
+/// Another file with the tensors of a published one that are read: what `tools/lpips_weights.py` makes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Twin {
+    /// Path below a folder of weights, with `/`.
+    pub path: &'static str,
+    /// SHA-256, hexadecimal.
+    pub sha256: &'static str,
 }
 
 /// Where a file is published.
@@ -59,15 +70,19 @@ pub enum Origin {
 }
 
 const fn url(path: &'static str, url: &'static str, sha256: &'static str) -> WeightFile {
-    WeightFile { path, origin: Origin::Url(url), sha256 }
+    WeightFile { path, origin: Origin::Url(url), sha256, twin: None }
+}
+
+const fn or(file: WeightFile, path: &'static str, sha256: &'static str) -> WeightFile {
+    WeightFile { twin: Some(Twin { path, sha256 }), ..file }
 }
 
 const fn hub(path: &'static str, repository: &'static str, file: &'static str) -> WeightFile {
-    WeightFile { path, origin: Origin::Hub { repository, path: file }, sha256: "" }
+    WeightFile { path, origin: Origin::Hub { repository, path: file }, sha256: "", twin: None }
 }
 
 const fn member(path: &'static str, url: &'static str, member: &'static str) -> WeightFile {
-    WeightFile { path, origin: Origin::Zip { url, member }, sha256: "" }
+    WeightFile { path, origin: Origin::Zip { url, member }, sha256: "", twin: None }
 }
 
 const DINO_B16: WeightFile = url(
@@ -87,7 +102,15 @@ pub const SETS: &[WeightSet] = &[
         purpose: "LPIPS on AlexNet",
         licence: "backbone BSD-3-Clause (torchvision), heads BSD-2-Clause (lpips)",
         files: &[
-            url("alexnet-owt-7be5be79.pth", "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth", "7be5be79"),
+            or(
+                url(
+                    "alexnet-owt-7be5be79.pth",
+                    "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth",
+                    "7be5be79",
+                ),
+                "alexnet-owt-7be5be79.safetensors",
+                "56010723d1a158768cf1cd27fa73a2b261ceb6633300f22a8381b4865286a2e3",
+            ),
             url(
                 "lpips/v0.1/alex.pth",
                 "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1/alex.pth",
@@ -100,7 +123,11 @@ pub const SETS: &[WeightSet] = &[
         purpose: "LPIPS on VGG16",
         licence: "backbone BSD-3-Clause (torchvision), heads BSD-2-Clause (lpips)",
         files: &[
-            url("vgg16-397923af.pth", "https://download.pytorch.org/models/vgg16-397923af.pth", "397923af"),
+            or(
+                url("vgg16-397923af.pth", "https://download.pytorch.org/models/vgg16-397923af.pth", "397923af"),
+                "vgg16-397923af.safetensors",
+                "4b2a978702e2ec75b21297ff870088260d11769286d67fe6500c3f5ef7ce52bd",
+            ),
             url(
                 "lpips/v0.1/vgg.pth",
                 "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1/vgg.pth",
@@ -210,12 +237,18 @@ impl Weights {
     /// # Errors
     /// [`MetricsError::NotFound`] if no folder has them; or if the set is unknown.
     pub fn find(&self, name: &str) -> Result<Vec<PathBuf>, MetricsError> {
+        Ok(self.parts(name)?.into_iter().map(|part| part.path).collect())
+    }
+
+    /// As [`find`](Self::find), with what the files are to be.
+    fn parts(&self, name: &str) -> Result<Vec<Part>, MetricsError> {
         let set = set(name)?;
         let mut missing = set.files[0].path; // of the folder that comes closest: the last file that is missing
         for folder in &self.folders {
-            match set.files.iter().find(|file| !is_there(folder, file)) {
-                None => return Ok(set.files.iter().map(|file| folder.join(file.path)).collect()),
-                Some(file) => missing = file.path,
+            let parts: Vec<_> = set.files.iter().map(|file| part(folder, file)).collect();
+            match parts.iter().position(Option::is_none) {
+                None => return Ok(parts.into_iter().flatten().collect()),
+                Some(i) => missing = set.files[i].path,
             }
         }
         let searched: Vec<String> = self.folders.iter().map(|f| f.display().to_string()).collect();
@@ -225,22 +258,41 @@ impl Weights {
 
     /// As [`find`](Self::find), and checks the files against the hashes that are known, noting what they are.
     pub(crate) fn open(&self, name: &str, used: &mut Vec<UsedFile>) -> Result<Vec<PathBuf>, MetricsError> {
-        let paths = self.find(name)?;
-        for (file, path) in set(name)?.files.iter().zip(&paths) {
-            for path in members(path)? {
-                let sha256 = check(&path, file.sha256)?;
-                let part = path.file_name().unwrap_or_default().to_string_lossy();
-                let file = if file.path.ends_with('/') { format!("{}{part}", file.path) } else { file.path.to_owned() };
+        let parts = self.parts(name)?;
+        for part in &parts {
+            for path in members(&part.path)? {
+                let sha256 = check(&path, part.sha256)?;
+                let member = path.file_name().unwrap_or_default().to_string_lossy();
+                let file =
+                    if part.name.ends_with('/') { format!("{}{member}", part.name) } else { part.name.to_owned() };
                 let entry = UsedFile { set: name.to_owned(), file, sha256 };
                 if !used.contains(&entry) {
                     used.push(entry);
                 }
             }
         }
-        Ok(paths)
+        Ok(parts.into_iter().map(|part| part.path).collect())
     }
 }
 
+/// A file or folder of a set that is there.
+struct Part {
+    /// Where.
+    path: PathBuf,
+    /// Its path below the folder of weights.
+    name: &'static str,
+    /// Its SHA-256, or the digits that are known of it.
+    sha256: &'static str,
+}
+
+/// The published file, or its twin, or neither.
+fn part(folder: &Path, file: &WeightFile) -> Option<Part> {
+    let published = Part { path: folder.join(file.path), name: file.path, sha256: file.sha256 };
+    let twin = || file.twin.map(|twin| Part { path: folder.join(twin.path), name: twin.path, sha256: twin.sha256 });
+    if is_there(folder, file) { Some(published) } else { twin().filter(|twin| twin.path.is_file()) }
+}
+
+/// Whether the published file, or folder of files, is there.
 fn is_there(folder: &Path, file: &WeightFile) -> bool {
     let path = folder.join(file.path);
     if file.path.ends_with('/') { path.is_dir() } else { path.is_file() }

@@ -16,6 +16,10 @@ fn the_table_is_consistent() {
                 Origin::Url(url) | Origin::Zip { url, .. } => assert!(url.starts_with("https://")),
                 Origin::Hub { repository, path } => assert!(repository.contains('/') && file.path.ends_with(path)),
             }
+            if let Some(twin) = file.twin {
+                assert_eq!(twin.path.strip_suffix(".safetensors"), Some(stem));
+                assert!(twin.sha256.len() == 64 && twin.sha256.bytes().all(|b| b.is_ascii_hexdigit()));
+            }
             if let Origin::Zip { member, .. } = file.origin {
                 assert_eq!(member.ends_with('/'), file.path.ends_with('/'));
             }
@@ -46,4 +50,23 @@ fn folders_are_searched_in_order_and_must_be_complete() {
     std::fs::write(second.path().join("dinov2-base/config.json.sha256"), "00").unwrap();
     let error = weights.open("dinov2-base", &mut used).unwrap_err();
     assert!(matches!(error, MetricsError::Checksum { .. }), "{error}");
+}
+
+#[test]
+fn a_twin_is_taken_where_the_published_file_is_missing() {
+    let folder = tempfile::tempdir().unwrap();
+    let weights = Weights::new([folder.path().to_owned()]);
+    std::fs::create_dir_all(folder.path().join("lpips/v0.1")).unwrap();
+    std::fs::write(folder.path().join("lpips/v0.1/vgg.pth"), b"x").unwrap();
+    let error = weights.find("lpips-vgg").unwrap_err().to_string();
+    assert!(error.contains("vgg16-397923af.pth"), "{error}");
+    let twin = folder.path().join("vgg16-397923af.safetensors");
+    std::fs::write(&twin, b"x").unwrap();
+    assert_eq!(weights.find("lpips-vgg").unwrap()[0], twin);
+    // It is held to a hash of its own.
+    let error = weights.open("lpips-vgg", &mut Vec::new()).unwrap_err().to_string();
+    assert!(error.contains("vgg16-397923af.safetensors") && error.contains("4b2a9787"), "{error}");
+    let published = folder.path().join("vgg16-397923af.pth");
+    std::fs::write(&published, b"x").unwrap();
+    assert_eq!(weights.find("lpips-vgg").unwrap()[0], published);
 }

@@ -8,6 +8,7 @@
 //! print in the table's colour, a foot in its own shadow, the opening of a handle. Work is done on small pictures, and only the outline is
 //! cut again on larger ones.
 
+mod confirm;
 mod evidence;
 mod hull;
 mod mask;
@@ -17,6 +18,7 @@ mod mixture;
 mod picture;
 mod plane;
 
+pub use confirm::confirmed;
 pub use evidence::{Compared, Evidence};
 pub use hull::overlap;
 pub use mend::OthersShow;
@@ -252,6 +254,26 @@ fn passes_by(picture: &Picture, centre: DVec3, x: f64, y: f64) -> f64 {
     (centre - picture.camera.center()).cross(picture.camera.ray_direction(x, y)).length()
 }
 
+/// The radius of the sphere about `centre` that the object is expected in: the hint's and a little more, or of the largest that half of the
+/// views show whole, as objects are shown whole. None where most views do not show its middle.
+fn expected_radius(pictures: &[Picture], centre: DVec3, hints: &Hints) -> Option<f64> {
+    let mut radii: Vec<f64> = pictures
+        .iter()
+        .map(|p| {
+            let (w, h) = (p.width() as f64, p.height() as f64);
+            let (x, y, z) = p.project(centre);
+            if z <= 0.0 || x <= 0.0 || y <= 0.0 || x >= w || y >= h {
+                return 0.0;
+            }
+            let border = [(0.0, y), (w, y), (x, 0.0), (x, h)];
+            border.iter().map(|(x, y)| passes_by(p, centre, *x, *y)).fold(f64::INFINITY, f64::min)
+        })
+        .collect();
+    radii.sort_by(f64::total_cmp);
+    let radius = hints.radius.map_or(radii[radii.len() / 2], |r| 1.1 * r);
+    (radius > 0.0).then_some(radius)
+}
+
 impl Stage {
     fn new(views: &[View], hints: &Hints) -> Result<Self, SceneError> {
         let pictures: Vec<Picture> = views.par_iter().map(|v| Picture::of(v, SMALL)).collect();
@@ -260,26 +282,11 @@ impl Stage {
             return Err(SceneError::NotCutOut { reason: reason.into() });
         };
         let distance = views.iter().map(|v| v.camera.center().distance(centre)).sum::<f64>() / views.len() as f64;
-        // The largest sphere that half of the views show whole; objects are shown whole.
-        let mut radii: Vec<f64> = pictures
-            .iter()
-            .map(|p| {
-                let (w, h) = (p.width() as f64, p.height() as f64);
-                let (x, y, z) = p.project(centre);
-                if z <= 0.0 || x <= 0.0 || y <= 0.0 || x >= w || y >= h {
-                    return 0.0;
-                }
-                let border = [(0.0, y), (w, y), (x, 0.0), (x, h)];
-                border.iter().map(|(x, y)| passes_by(p, centre, *x, *y)).fold(f64::INFINITY, f64::min)
-            })
-            .collect();
-        radii.sort_by(f64::total_cmp);
-        let radius = hints.radius.map_or(radii[radii.len() / 2], |r| 1.1 * r);
-        if radius.is_nan() || radius <= 0.0 {
+        let Some(radius) = expected_radius(&pictures, centre, hints) else {
             let reason =
                 "the point that the cameras look at is not in the photos; say where the object is (--center X,Y,Z)";
             return Err(SceneError::NotCutOut { reason: reason.into() });
-        }
+        };
         let mut stage = Self { pictures, centre, radius, distance, plane: None, best: None };
         let object: Vec<Vec<bool>> =
             (0..views.len()).map(|i| stage.nearness(i).iter().map(|d| *d < 0.6).collect()).collect();
