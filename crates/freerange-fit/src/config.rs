@@ -242,7 +242,25 @@ impl FitConfig {
 /// Part of the steps of a refinement after which there are no more rounds of growth: the last Gaussians have to settle.
 const GROWTH_STOP: f64 = 5.0 / 6.0;
 
+/// Photos that the defaults of a refinement are for, and those from which on more change nothing.
+const PHOTOS: usize = 4;
+const MOST_PHOTOS: usize = 16;
+
 impl RefineConfig {
+    /// These settings, which are for up to four photos, for so many: as many steps for each, more of their pixels, and less of a hold, since
+    /// more of the object is seen. From sixteen photos on nothing changes any more.
+    #[must_use]
+    pub fn for_photos(self, photos: usize) -> Self {
+        let photos = photos.clamp(PHOTOS, MOST_PHOTOS);
+        let more = photos as f64 / PHOTOS as f64;
+        Self {
+            steps: self.steps * photos / PHOTOS,
+            render_size: self.render_size.map(|size| (f64::from(size) * more.sqrt()).round() as u32),
+            hold: HoldConfig { weight: self.hold.weight / more.powf(1.5), ..self.hold },
+            ..self
+        }
+    }
+
     /// Refuses values that no refinement can work with.
     pub fn check(&self) -> Result<(), FitError> {
         let steps = self.steps;
@@ -295,6 +313,23 @@ impl HoldConfig {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn more_photos_are_refined_longer_and_larger_and_held_less() {
+        let config = RefineConfig::default();
+        for photos in [0, 2, 4] {
+            assert_eq!(config.clone().for_photos(photos), config);
+        }
+        let eight = config.clone().for_photos(8);
+        assert_eq!((eight.steps, eight.render_size), (1000, Some(362)));
+        assert!((eight.hold.weight - 0.1 / 8f64.sqrt()).abs() < 1e-12);
+        let sixteen = config.clone().for_photos(16);
+        assert_eq!((sixteen.steps, sixteen.render_size, sixteen.hold.weight), (2000, Some(512), 0.1 / 8.0));
+        assert_eq!(config.clone().for_photos(usize::MAX), sixteen);
+        sixteen.check().unwrap();
+        let whole = RefineConfig { render_size: None, ..config };
+        assert_eq!(whole.for_photos(8).render_size, None);
+    }
 
     #[test]
     fn defaults_pass_and_survive_serde() {

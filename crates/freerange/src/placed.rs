@@ -29,7 +29,7 @@ pub(crate) struct Placed {
     /// About which its outlines may be turned.
     axis: Option<Axis>,
     /// How many views there were, before anything was added to them.
-    photos: usize,
+    pub photos: usize,
     /// Whether they are where they are to stay.
     pub settled: bool,
 }

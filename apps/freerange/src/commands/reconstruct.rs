@@ -89,7 +89,8 @@ pub struct Sampling {
     #[arg(long, value_name = "FOLDER", requires = "checkpoint")]
     pub encoder_weights: Option<PathBuf>,
     /// Continue from the sample with so many steps of 3DGS-MCMC on the input views, up to 8,192 Gaussians and held in
-    /// place where no view looks; 500 are enough, 0 is none [default: the checkpoint's].
+    /// place where no view looks; 500 are enough, 0 is none. Of more than four views a quarter of it for each, up to
+    /// sixteen [default: the checkpoint's].
     #[arg(long, value_name = "STEPS")]
     pub refine: Option<usize>,
     /// Begin that refinement with so many samples together, and hold it at their mean pictures; 1 is the sample alone [default: the checkpoint's].

@@ -59,8 +59,8 @@ pub struct SampleConfig {
     /// outlines to be more of what every fit agrees with. 0: none is looked for. [`reconstruct`](super::reconstruct) itself knows of none.
     #[serde(skip_serializing_if = "is_nothing")]
     pub turn: f32,
-    /// Steps of 3DGS-MCMC on the input views that follow ([`freerange_fit::refine`]); [`reconstruct`](super::reconstruct)
-    /// itself takes none.
+    /// Steps of 3DGS-MCMC on up to four input views that follow ([`freerange_fit::refine`]), of more views more
+    /// ([`for_photos`](freerange_fit::RefineConfig::for_photos)); [`reconstruct`](super::reconstruct) itself takes none.
     pub refine: usize,
     /// How many samples refinement begins with and is held at the mean pictures of, each from a fit and noise of its own.
     /// [`reconstruct`](super::reconstruct) itself draws what it is asked for.
