@@ -8,7 +8,7 @@ use freerange_camera::View;
 use image::GrayImage;
 use rayon::prelude::*;
 
-/// One view in this many may miss a part of the object.
+/// One view in this many may miss a part of the object, but one in any case.
 const MISSING: usize = 4;
 /// How far the outlines of hulls, which are made of cubes and of rounded masks, may lie within the object's, in pixels of small pictures.
 const MARGIN: usize = 3;
@@ -26,7 +26,7 @@ pub fn confirmed(views: &[View], hints: &Hints) -> Option<Vec<Option<Vec<u8>>>> 
     let masks: Vec<Vec<bool>> = pictures.iter().map(|p| p.valid.clone()).collect();
     let centre = hints.center.or_else(|| meeting_point(views))?;
     let radius = expected_radius(&pictures, centre, hints)?;
-    let hull = Hull::carve(&pictures, &masks, centre, 1.3 * radius, None, views.len() / MISSING, FINE)?;
+    let hull = Hull::carve(&pictures, &masks, centre, 1.3 * radius, None, (views.len() / MISSING).max(1), FINE)?;
     let keep = views.par_iter().zip(&pictures).zip(&masks).map(|((view, picture), mask)| {
         let (w, h) = (picture.width(), picture.height());
         let there = grown(&hull.outline(picture), w, h, MARGIN);
