@@ -32,7 +32,7 @@ def main():
     ]
     for psnr in range(low, high + 1):
         out.append(f'<path d="M{LEFT} {y(psnr):.1f}H{WIDTH - RIGHT}" stroke="#ddd"/><text x="{LEFT - 8}" y="{y(psnr) + 4:.1f}" text-anchor="end">{psnr}</text>')
-    for samples in range(0, last + 1, 20_000):
+    for samples in range(0, last + 1, 40_000):
         out.append(f'<text x="{x(samples):.1f}" y="{HEIGHT - BOTTOM + 18}" text-anchor="middle">{samples // 1000}k</text>')
     out.append(f'<text x="{(LEFT + WIDTH - RIGHT) / 2}" y="{HEIGHT - 10}" text-anchor="middle">samples seen in training</text>')
     out.append(f'<text x="{LEFT}" y="18">PSNR in dB, {data["protocol"]}</text>')
