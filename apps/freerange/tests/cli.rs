@@ -299,10 +299,10 @@ fn checkpoints_are_averaged_weight_by_weight() {
     };
     let mut bytes = std::fs::read(&shipped).unwrap();
     let start = bytes.len() - weights(&shipped).len();
-    let depth = bytes[..start].windows(12).position(|w| w == b"\"depth\":\"10\"").expect("1,024 Gaussians");
-    bytes[depth + 10] = b'1';
+    let depth = bytes[..start].windows(12).position(|w| w == b"\"depth\":\"11\"").expect("2,048 Gaussians");
+    bytes[depth + 10] = b'2';
     std::fs::write(place("deeper"), &bytes).unwrap();
-    bytes[depth + 10] = b'0';
+    bytes[depth + 10] = b'1';
     bytes[start..].chunks_exact_mut(2).for_each(|weight| weight[1] ^= 0x80); // the sign of each
     std::fs::write(place("opposite"), &bytes).unwrap();
 
