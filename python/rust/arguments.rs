@@ -117,6 +117,7 @@ pub struct Sampling {
     seeds: Vec<u64>,
     steps: Option<usize>,
     refine: Option<usize>,
+    detail: Option<usize>,
     ensemble: Option<usize>,
     polish: Option<usize>,
     mend: Option<usize>,
@@ -150,6 +151,7 @@ impl Sampling {
         sample.cfg_scale = self.cfg_scale.unwrap_or(sample.cfg_scale);
         sample.lambda_pg = self.lambda_pg.unwrap_or(sample.lambda_pg);
         sample.refine = self.refine.unwrap_or(sample.refine);
+        sample.detail = self.detail.unwrap_or(sample.detail);
         sample.polish = self.polish.unwrap_or(sample.polish);
         sample.mend = self.mend.unwrap_or(sample.mend);
         sample.regroup = self.regroup.unwrap_or(sample.regroup);

@@ -38,7 +38,10 @@ def test_same_bytes_as_the_command_line(program, model, bowl, tmp_path):
     """Of the folder, and of arrays that NumPy and Pillow have read: with every default, and with options."""
     for arguments, options in [
         ([], {}),
-        (["--seed", "3", "--refine", "0", "--steps", "2"], dict(seed=3, refine=0, steps=2)),
+        (
+            ["--seed", "3", "--refine", "10", "--detail", "2", "--ensemble", "1", "--steps", "2"],
+            dict(seed=3, refine=10, detail=2, ensemble=1, steps=2),
+        ),
     ]:
         out = tmp_path / f"out{len(arguments)}"
         subprocess.run([program, "reconstruct", BOWL, "-o", out, "--device", "cpu", *arguments], check=True)
@@ -209,6 +212,7 @@ def spoiled(array, at):
         (dict(seed=1.5), TypeError, ["seed", "integer", "1.5"]),
         (dict(seed=[]), ValueError, ["seed", "1 to 64"]),
         (dict(steps=0), ValueError, ["steps", "1 to", "found 0"]),
+        (dict(detail=17), ValueError, ["detail", "1 to 16", "found 17"]),
         (dict(refine="many"), TypeError, ["refine", "integer", "'many'"]),
         (dict(solver="newton"), ValueError, ["solver", "'euler'", "'newton'"]),
         (dict(start="zero"), ValueError, ["start", "'fit' or 'noise'", "'zero'"]),

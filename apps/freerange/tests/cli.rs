@@ -79,7 +79,19 @@ fn reconstruct_writes_everything_and_its_cloud_can_be_rendered_from_the_users_ca
     let place = tempfile::tempdir().unwrap();
     let output = place.path().join("result");
     let (scene, out) = (example(), output.to_str().unwrap().to_owned());
-    let args = ["reconstruct", scene.to_str().unwrap(), "-o", &out, "--steps", "3", "--refine", "5", "--json"];
+    let args = [
+        "reconstruct",
+        scene.to_str().unwrap(),
+        "-o",
+        &out,
+        "--steps",
+        "3",
+        "--refine",
+        "5",
+        "--detail",
+        "2",
+        "--json",
+    ];
     let done = freerange(&args);
     assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
     let report: serde_json::Value = serde_json::from_slice(&done.stdout).unwrap();
@@ -89,6 +101,7 @@ fn reconstruct_writes_everything_and_its_cloud_can_be_rendered_from_the_users_ca
     assert!(report["samples"][0]["further_views"]["psnr"].as_f64().unwrap() > 5.0);
     assert!(report["samples"][0]["before_refinement"]["input_views"]["psnr"].as_f64().is_some());
     assert!(report["seconds"].as_array().unwrap().len() >= 4);
+    assert_eq!(report["gaussians"], 2 * 8192, "detail is more Gaussians");
 
     // What was exported, read back and rendered, is what was reported.
     let cameras = scene.join("transforms_test.json");
@@ -141,6 +154,13 @@ fn the_same_seed_gives_the_same_bytes() {
     };
     assert_eq!(run("a", "7"), run("b", "7"));
     assert_ne!(run("a", "7"), run("c", "8"));
+}
+
+#[test]
+fn no_detail_and_too_much() {
+    for (detail, found) in [("0", "found 0"), ("17", "found 17")] {
+        refused(&example(), &["--detail", detail], &["detail", "1 to 16", found]);
+    }
 }
 
 #[test]

@@ -261,6 +261,20 @@ impl RefineConfig {
         }
     }
 
+    /// These settings for finer detail in more time: so many times the steps, the size of pictures and the Gaussians, and so much less of a
+    /// hold, whose own pictures are small. 1 changes nothing.
+    #[must_use]
+    pub fn detailed(self, detail: usize) -> Self {
+        let detail = detail.max(1);
+        Self {
+            steps: self.steps.saturating_mul(detail),
+            gaussians: self.gaussians.saturating_mul(detail),
+            render_size: self.render_size.map(|size| size.saturating_mul(detail as u32)),
+            hold: HoldConfig { weight: self.hold.weight / detail as f64, ..self.hold },
+            ..self
+        }
+    }
+
     /// Refuses values that no refinement can work with.
     pub fn check(&self) -> Result<(), FitError> {
         let steps = self.steps;
@@ -329,6 +343,19 @@ mod tests {
         sixteen.check().unwrap();
         let whole = RefineConfig { render_size: None, ..config };
         assert_eq!(whole.for_photos(8).render_size, None);
+    }
+
+    #[test]
+    fn detail_is_steps_size_and_gaussians() {
+        let config = RefineConfig::default();
+        for detail in [0, 1] {
+            assert_eq!(config.clone().detailed(detail), config);
+        }
+        let four = config.clone().detailed(4);
+        assert_eq!((four.steps, four.gaussians, four.render_size, four.hold.weight), (2000, 32_768, Some(1024), 0.025));
+        four.check().unwrap();
+        let whole = RefineConfig { render_size: None, ..config };
+        assert_eq!(whole.detailed(4).render_size, None);
     }
 
     #[test]

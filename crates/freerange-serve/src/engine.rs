@@ -57,6 +57,8 @@ pub struct JobOptions {
     pub seed: Option<u64>,
     /// Steps of refinement on the photos; the model's own where it is left out.
     pub refine: Option<usize>,
+    /// Times as fine a refinement; the model's own where it is left out.
+    pub detail: Option<usize>,
     /// Steps of sampling; the model's own where it is left out.
     pub steps: Option<usize>,
     /// Where sampling starts; the model's own way where it is left out.
@@ -84,6 +86,7 @@ impl JobOptions {
         // Numbers of JavaScript are exact up to here.
         within("seed", self.seed, 0, (1 << 53) - 1)?;
         within("refine", self.refine.map(|v| v as u64), 0, 5000)?;
+        within("detail", self.detail.map(|v| v as u64), 1, 4)?;
         within("steps", self.steps.map(|v| v as u64), 1, 200)
     }
 

@@ -359,7 +359,8 @@ fn finished(
                 true => HoldConfig::default(),
                 false => HoldConfig { weight: 0.3, views: 24, ..HoldConfig::default() },
             };
-            let config = RefineConfig { steps, hold, seed, ..RefineConfig::default() }.for_photos(placed.photos);
+            let config = RefineConfig { steps, hold, seed, ..RefineConfig::default() };
+            let config = config.for_photos(placed.photos).detailed(options.sample.detail);
             let fit = |p: &mut dyn FnMut(&FitProgress<'_>) -> _| refine(&plain, &members, placed.all(), &config, p);
             let refined = watched(Stage::Refine, i, place, tell, config.steps, fit)?;
             (refined, Some(to_user(&plain, place)))

@@ -119,7 +119,7 @@ class Model:
         direction. `center`, `radius`: where the object is, if that is known. `on_step`: called with a `Step` after each; what it
         raises ends the work, as Ctrl-C does.
 
-        Further options are those of the command line, by default the checkpoint's: `steps`, `refine`, `ensemble`, `polish`, `mend`, `regroup`, `mirror`, `turn`,
+        Further options are those of the command line, by default the checkpoint's: `steps`, `refine`, `detail`, `ensemble`, `polish`, `mend`, `regroup`, `mirror`, `turn`,
         `start` ("fit" or "noise"), `depth`, `cfg_scale`, `lambda_pg`, `solver`, `compute`, `views`.
         """
         seeds, sampling = _sampling(seed, options)
@@ -153,7 +153,7 @@ class Model:
         return _made(self._model.reconstruct_scene(scene._scene, sampling, _told(on_step)), seeds, seed)
 
 
-_COUNTS = {"steps": 1, "refine": 0, "ensemble": 1, "polish": 0, "mend": 0, "regroup": 0, "depth": 1, "views": 1}
+_COUNTS = {"steps": 1, "refine": 0, "detail": 1, "ensemble": 1, "polish": 0, "mend": 0, "regroup": 0, "depth": 1, "views": 1}
 _NUMBERS = ("cfg_scale", "lambda_pg", "mirror", "turn")
 _NAMES = ("start", "solver", "compute")
 

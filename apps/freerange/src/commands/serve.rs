@@ -178,6 +178,7 @@ impl Engine for Local {
     ) -> Result<Outcome, EngineError> {
         let mut sampling = self.sampling.clone();
         sampling.refine = wanted.refine.or(sampling.refine);
+        sampling.detail = wanted.detail.or(sampling.detail);
         sampling.steps = wanted.steps.or(sampling.steps);
         sampling.start = match wanted.start {
             None => sampling.start,

@@ -7,6 +7,9 @@ use freerange_model::Compute;
 use super::{Background, sampler::PhotometricStep, solver::Solver};
 use crate::{FlowError, coupling::Coupling};
 
+/// Minutes of a laptop, and as many Gaussians as any viewer shows.
+const MOST_DETAIL: usize = 16;
+
 /// How to sample.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -62,6 +65,10 @@ pub struct SampleConfig {
     /// Steps of 3DGS-MCMC on up to four input views that follow ([`freerange_fit::refine`]), of more views more
     /// ([`for_photos`](freerange_fit::RefineConfig::for_photos)); [`reconstruct`](super::reconstruct) itself takes none.
     pub refine: usize,
+    /// Refinement to finer detail: so many times the steps, the size of pictures and the Gaussians, and less of a hold
+    /// ([`detailed`](freerange_fit::RefineConfig::detailed)).
+    #[serde(skip_serializing_if = "is_one")]
+    pub detail: usize,
     /// How many samples refinement begins with and is held at the mean pictures of, each from a fit and noise of its own.
     /// [`reconstruct`](super::reconstruct) itself draws what it is asked for.
     #[serde(skip_serializing_if = "is_one")]
@@ -129,6 +136,7 @@ impl Default for SampleConfig {
             mirror: 0.0,
             turn: 0.0,
             refine: 0,
+            detail: 1,
             ensemble: 1,
             polish: 0,
             mend: 0,
@@ -204,6 +212,9 @@ impl SampleConfig {
         }
         if self.refine > 100_000 {
             return bad("refine", "0 to 100000", self.refine.to_string());
+        }
+        if !(1..=MOST_DETAIL).contains(&self.detail) {
+            return bad("detail", &format!("1 to {MOST_DETAIL}"), self.detail.to_string());
         }
         if !(1..=64).contains(&self.ensemble) {
             return bad("ensemble", "1 to 64", self.ensemble.to_string());

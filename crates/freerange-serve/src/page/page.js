@@ -501,8 +501,8 @@
     e.preventDefault();
     void attempt(async () => {
       if (!job) return;
-      const start = select("start-at").value, refine = input("refine").value;
-      const options = { samples: Number(input("samples").value), seed: Number(input("seed").value), ...(start ? { start } : {}), ...(refine === "" ? {} : { refine: Number(refine) }) };
+      const start = select("start-at").value, refine = input("refine").value, detail = input("detail").value;
+      const options = { samples: Number(input("samples").value), seed: Number(input("seed").value), ...(start ? { start } : {}), ...(refine === "" ? {} : { refine: Number(refine) }), ...(detail === "" ? {} : { detail: Number(detail) }) };
       drawn = 0;
       document.body.dataset.estimates = "0";
       delete document.body.dataset.result;
