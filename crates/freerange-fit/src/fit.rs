@@ -36,13 +36,13 @@ pub fn fit<'a>(
         Some(cloud) => checked(cloud, config.cap_max)?,
         None => random_cloud(&targets, config, &mut rng),
     };
-    optimise(cloud, &targets, config, &mut rng, |_, _| Ok(Vec::new()), progress)
+    optimise(cloud, |_| &targets, config, &mut rng, |_, _| Ok(Vec::new()), progress)
 }
 
-/// The optimisation itself. `more` are further terms of the objective of a cloud over a background.
-pub(crate) fn optimise(
+/// The optimisation itself. `of_step` is what each step compares with, at whatever size; `more` are further terms of the objective of a cloud over a background.
+pub(crate) fn optimise<'t>(
     mut cloud: Cloud,
-    targets: &Targets,
+    of_step: impl Fn(usize) -> &'t Targets,
     config: &FitConfig,
     rng: &mut ChaCha8Rng,
     mut more: impl FnMut(&Cloud, [f32; 3]) -> Result<Vec<Objective>, FitError> + Send,
@@ -50,8 +50,9 @@ pub(crate) fn optimise(
 ) -> Result<Cloud, FitError> {
     let mut adam = Adam::default();
     let (mut queue, mut outline_queue) = (Vec::new(), Vec::new());
-    let outlines = targets.cameras.len() - targets.views;
     for step in 0..config.iterations {
+        let targets = of_step(step);
+        let outlines = targets.cameras.len() - targets.views;
         let done = step as f64 / config.iterations as f64;
         let mean_rate = config.rates.mean * (config.final_mean_rate / config.rates.mean).powf(done);
 
