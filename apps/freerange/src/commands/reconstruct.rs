@@ -93,8 +93,8 @@ pub struct Sampling {
     /// sixteen [default: the checkpoint's].
     #[arg(long, value_name = "STEPS")]
     pub refine: Option<usize>,
-    /// Refine to finer detail: so many times the steps, the size at which photos are compared and the Gaussians, 1 to 16. Sharper
-    /// prints, hardly another PSNR, in a multiple of the time [default: the checkpoint's].
+    /// Refine to finer detail: so many times the steps, the size at which photos are compared and the Gaussians, 1 to 16. Lower
+    /// LPIPS, hardly another PSNR, in a multiple of the time [default: the checkpoint's].
     #[arg(long, value_name = "TIMES")]
     pub detail: Option<usize>,
     /// Begin that refinement with so many samples together, and hold it at their mean pictures; 1 is the sample alone [default: the checkpoint's].

@@ -7,7 +7,7 @@ use freerange_model::Compute;
 use super::{Background, sampler::PhotometricStep, solver::Solver};
 use crate::{FlowError, coupling::Coupling};
 
-/// Minutes of a laptop, and as many Gaussians as any viewer shows.
+/// Far above what has been measured (three), so that nobody waits for hours by a slip.
 const MOST_DETAIL: usize = 16;
 
 /// How to sample.
