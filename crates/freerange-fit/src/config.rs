@@ -249,33 +249,37 @@ const GROWTH_STOP: f64 = 5.0 / 6.0;
 const PHOTOS: usize = 4;
 const MOST_PHOTOS: usize = 16;
 
+/// Up to so many pixels, the longest side, pictures grow with the number of photos.
+const MOST_GROWN: u32 = 512;
+
 /// What [`RefineConfig::coarse`] is where detail is asked for: a third less time, and the same in the end.
 const COARSE: f64 = 0.6;
 
 impl RefineConfig {
-    /// These settings, which are for up to four photos, for so many: as many steps for each, more of their pixels, and less of a hold, since
-    /// more of the object is seen. From sixteen photos on nothing changes any more.
+    /// These settings, which are for up to four photos, for so many: as many steps for each, more of their pixels, up to 512, and less of a
+    /// hold, since more of the object is seen. From sixteen photos on nothing changes any more.
     #[must_use]
     pub fn for_photos(self, photos: usize) -> Self {
         let photos = photos.clamp(PHOTOS, MOST_PHOTOS);
         let more = photos as f64 / PHOTOS as f64;
+        let grown = |size: u32| ((f64::from(size) * more.sqrt()).round() as u32).min(size.max(MOST_GROWN));
         Self {
             steps: self.steps * photos / PHOTOS,
-            render_size: self.render_size.map(|size| (f64::from(size) * more.sqrt()).round() as u32),
+            render_size: self.render_size.map(grown),
             hold: HoldConfig { weight: self.hold.weight / more.powf(1.5), ..self.hold },
             ..self
         }
     }
 
-    /// These settings for finer detail in more time: so many times the steps, the size of pictures and the Gaussians, and so much less of a
-    /// hold, whose own pictures are small; at first at half that size. 1 changes nothing.
+    /// These settings for finer detail: so many times the size of pictures and the Gaussians, and so much less of a hold, whose own pictures
+    /// are small; at first at half that size. From 3 on half as many times the steps as well: 2 needs no more of them. 1 changes nothing.
     #[must_use]
     pub fn detailed(self, detail: usize) -> Self {
         if detail < 2 {
             return self;
         }
         Self {
-            steps: self.steps.saturating_mul(detail),
+            steps: self.steps.saturating_mul(detail) / 2,
             gaussians: self.gaussians.saturating_mul(detail),
             render_size: self.render_size.map(|size| size.saturating_mul(detail as u32)),
             coarse: COARSE,
@@ -351,18 +355,24 @@ mod tests {
         assert_eq!((sixteen.steps, sixteen.render_size, sixteen.hold.weight), (2000, Some(512), 0.1 / 8.0));
         assert_eq!(config.clone().for_photos(usize::MAX), sixteen);
         sixteen.check().unwrap();
+        // What is as large already stays.
+        let detailed = config.clone().detailed(2).for_photos(8);
+        assert_eq!((detailed.steps, detailed.render_size, detailed.gaussians), (1000, Some(512), 16_384));
+        assert_eq!(config.clone().detailed(4).for_photos(16).render_size, Some(1024));
         let whole = RefineConfig { render_size: None, ..config };
         assert_eq!(whole.for_photos(8).render_size, None);
     }
 
     #[test]
-    fn detail_is_steps_size_and_gaussians() {
+    fn detail_is_size_and_gaussians_and_later_steps() {
         let config = RefineConfig::default();
         for detail in [0, 1] {
             assert_eq!(config.clone().detailed(detail), config);
         }
+        let two = config.clone().detailed(2);
+        assert_eq!((two.steps, two.gaussians, two.render_size, two.hold.weight), (500, 16_384, Some(512), 0.05));
         let four = config.clone().detailed(4);
-        assert_eq!((four.steps, four.gaussians, four.render_size, four.coarse), (2000, 32_768, Some(1024), 0.6));
+        assert_eq!((four.steps, four.gaussians, four.render_size, four.coarse), (1000, 32_768, Some(1024), 0.6));
         assert_eq!(four.hold.weight, 0.025);
         four.check().unwrap();
         let whole = RefineConfig { render_size: None, ..config };

@@ -22,21 +22,56 @@ proptest! {
     }
 }
 
+/// Sizes of one pixel, of less than a strip of columns or a group of rows, of a whole number of them, and of more.
+const SIZES: [(usize, usize); 7] = [(1, 1), (3, 20), (10, 8), (11, 3), (32, 9), (43, 16), (70, 31)];
+
+/// Two images that share something.
+fn two(w: usize, h: usize) -> [Vec<f32>; 2] {
+    [3, 5].map(|k| (0..3 * w * h).map(|i| 0.5 + 0.4 * ((i * k + i) as f32 * 0.37).sin()).collect())
+}
+
+/// From the definition, window by window.
+#[test]
+fn ssim_equals_a_slow_one() {
+    let weight = |d: usize| (-((d * d) as f64) / 4.5).exp();
+    let norm = (weight(0) + 2.0 * (1..=5).map(weight).sum::<f64>()).powi(2);
+    for (w, h) in SIZES {
+        let [a, b] = two(w, h);
+        let mut total = 0.0;
+        for (at, c) in (0..w * h).flat_map(|at| (0..3).map(move |c| (at, c))) {
+            let (x, y) = (at % w, at / w);
+            let mut m = [0.0f64; 5]; // means of x, y, xx, yy, xy; black beyond the border
+            for (u, v) in (0..w * h).map(|i| (i % w, i / w)).filter(|(u, v)| u.abs_diff(x) <= 5 && v.abs_diff(y) <= 5) {
+                let (p, q) = (f64::from(a[3 * (v * w + u) + c]), f64::from(b[3 * (v * w + u) + c]));
+                let share = weight(u.abs_diff(x)) * weight(v.abs_diff(y)) / norm;
+                m.iter_mut().zip([p, q, p * p, q * q, p * q]).for_each(|(m, value)| *m += share * value);
+            }
+            let [p, q, pp, qq, pq] = m;
+            total += (2.0 * p * q + 1e-4) * (2.0 * (pq - p * q) + 9e-4)
+                / ((p * p + q * q + 1e-4) * (pp - p * p + qq - q * q + 9e-4));
+        }
+        let (expected, found) = (total / (3 * w * h) as f64, ssim_3dgs(&a, &b, w, h).unwrap());
+        assert!((expected - found).abs() < 1e-6, "{w} x {h}: {expected} {found}");
+    }
+}
+
 #[test]
 fn gradient_is_that_of_finite_differences() {
-    let (w, h) = (9, 14);
-    let value = |i: usize, k: usize| 0.5 + 0.4 * ((i * k + i) as f32 * 0.37).sin();
-    let a: Vec<f32> = (0..3 * w * h).map(|i| value(i, 3)).collect();
-    let b: Vec<f32> = (0..3 * w * h).map(|i| value(i, 5)).collect();
-    let (_, gradient) = ssim_with_gradient(&a, &b, w, h).unwrap();
-    for i in (0..a.len()).step_by(7) {
-        let at = |delta: f32| {
-            let mut moved = a.clone();
-            moved[i] += delta;
-            ssim_3dgs(&moved, &b, w, h).unwrap()
-        };
-        let numeric = (at(2e-3) - at(-2e-3)) / 4e-3;
-        assert!((numeric - f64::from(gradient[i])).abs() < 2e-5, "{i}: {numeric} {}", gradient[i]);
+    for (w, h) in SIZES {
+        let [a, b] = two(w, h);
+        let (value, gradient) = ssim_with_gradient(&a, &b, w, h).unwrap();
+        assert_eq!(value, ssim_3dgs(&a, &b, w, h).unwrap());
+        let n = a.len() as f64;
+        for i in (0..a.len()).step_by(a.len() / 40 + 1) {
+            let at = |delta: f32| {
+                let mut moved = a.clone();
+                moved[i] += delta;
+                n * ssim_3dgs(&moved, &b, w, h).unwrap()
+            };
+            let (numeric, found) = ((at(2e-3) - at(-2e-3)) / 4e-3, n * f64::from(gradient[i]));
+            let tolerance = 2e-3 + 1e-2 * found.abs();
+            assert!((numeric - found).abs() < tolerance, "{w} x {h}, {i}: {numeric} {found}");
+        }
     }
 }
 

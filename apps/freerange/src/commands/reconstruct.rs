@@ -88,13 +88,13 @@ pub struct Sampling {
     /// where it was when the model was trained, or where `freerange weights fetch` puts it].
     #[arg(long, value_name = "FOLDER", requires = "checkpoint")]
     pub encoder_weights: Option<PathBuf>,
-    /// Continue from the sample with so many steps of 3DGS-MCMC on the input views, up to 8,192 Gaussians and held in
-    /// place where no view looks; 500 are enough, 0 is none. Of more than four views a quarter of it for each, up to
-    /// sixteen [default: the checkpoint's].
+    /// Continue from the sample with so many steps of 3DGS-MCMC on the input views, with more Gaussians and held in place
+    /// where no view looks; 500 are enough, 1000 somewhat sharper, 0 is none. Of more than four views a quarter of it for
+    /// each, up to sixteen [default: the checkpoint's].
     #[arg(long, value_name = "STEPS")]
     pub refine: Option<usize>,
-    /// Refine to finer detail: so many times the steps, the size at which photos are compared and the Gaussians, 1 to 16. Lower
-    /// LPIPS, hardly another PSNR, in a multiple of the time [default: the checkpoint's].
+    /// How fine the detail is that refinement looks for, 1 to 16: so many times 256 pixels, at which photos are compared, and
+    /// 8,192 Gaussians. More lowers LPIPS, and hardly changes PSNR, in more time; 1 is quickest [default: the checkpoint's].
     #[arg(long, value_name = "TIMES")]
     pub detail: Option<usize>,
     /// Begin that refinement with so many samples together, and hold it at their mean pictures; 1 is the sample alone [default: the checkpoint's].

@@ -65,9 +65,9 @@ pub struct SampleConfig {
     /// Steps of 3DGS-MCMC on up to four input views that follow ([`freerange_fit::refine`]), of more views more
     /// ([`for_photos`](freerange_fit::RefineConfig::for_photos)); [`reconstruct`](super::reconstruct) itself takes none.
     pub refine: usize,
-    /// Refinement to finer detail: so many times the steps, the size of pictures and the Gaussians, and less of a hold
+    /// How fine the detail is that refinement looks for: so many times 256 pixels and 8,192 Gaussians, and less of a hold
     /// ([`detailed`](freerange_fit::RefineConfig::detailed)).
-    #[serde(skip_serializing_if = "is_one")]
+    #[serde(skip_serializing_if = "is_usual")]
     pub detail: usize,
     /// How many samples refinement begins with and is held at the mean pictures of, each from a fit and noise of its own.
     /// [`reconstruct`](super::reconstruct) itself draws what it is asked for.
@@ -136,7 +136,7 @@ impl Default for SampleConfig {
             mirror: 0.0,
             turn: 0.0,
             refine: 0,
-            detail: 1,
+            detail: DETAIL,
             ensemble: 1,
             polish: 0,
             mend: 0,
@@ -155,6 +155,13 @@ fn is_zero(x: &usize) -> bool {
 
 fn is_nothing(x: &f32) -> bool {
     *x == 0.0
+}
+
+/// What [`SampleConfig::detail`] is where nothing says otherwise.
+const DETAIL: usize = 2;
+
+fn is_usual(detail: &usize) -> bool {
+    *detail == DETAIL
 }
 
 fn is_one(x: &usize) -> bool {
