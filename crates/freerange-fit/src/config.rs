@@ -125,8 +125,10 @@ pub struct RefineConfig {
     pub background: Background,
     /// Longest side, in pixels, at which views are compared; larger ones are shrunk. None: as they are.
     pub render_size: Option<u32>,
-    /// Part of the steps, the first ones, that compare views at half that size: what they see is coarse as yet. 0..1
+    /// Part of the steps, the first ones, that compare views at [`coarse_size`](Self::coarse_size): what they see is coarse as yet. 0..1
     pub coarse: f64,
+    /// Longest side in pixels at which these steps compare views. Smaller views are compared as they are.
+    pub coarse_size: u32,
     /// What keeps the cloud where no view looks.
     pub hold: HoldConfig,
     /// Seed of everything drawn.
@@ -145,6 +147,7 @@ impl Default for RefineConfig {
             background: Background::Random,
             render_size: Some(256),
             coarse: 0.0,
+            coarse_size: 256,
             hold: HoldConfig::default(),
             seed: 0,
         }
@@ -273,16 +276,21 @@ impl RefineConfig {
 
     /// These settings for finer detail: so many times the size of pictures and the Gaussians, and so much less of a hold, whose own pictures
     /// are small; at first at half that size. From 3 on half as many times the steps as well: 2 needs no more of them. 1 changes nothing.
+    /// Photos, whose longest side has `longest` pixels, have no finer detail than their pixels: it is as much as they can show at most.
     #[must_use]
-    pub fn detailed(self, detail: usize) -> Self {
+    pub fn detailed(self, detail: usize, longest: u32) -> Self {
+        let shown = self.render_size.map_or(usize::MAX, |size| longest.div_ceil(size.max(1)) as usize);
+        let detail = detail.min(shown);
         if detail < 2 {
             return self;
         }
+        let grown = |size: u32| size.saturating_mul(detail as u32);
         Self {
             steps: self.steps.saturating_mul(detail) / 2,
             gaussians: self.gaussians.saturating_mul(detail),
-            render_size: self.render_size.map(|size| size.saturating_mul(detail as u32)),
+            render_size: self.render_size.map(grown),
             coarse: COARSE,
+            coarse_size: (grown(self.coarse_size) / 2).max(1),
             hold: HoldConfig { weight: self.hold.weight / detail as f64, ..self.hold },
             ..self
         }
@@ -299,6 +307,7 @@ impl RefineConfig {
         fraction("lambda_ssim", self.lambda_ssim)?;
         check_render_size(self.render_size)?;
         fraction("coarse", self.coarse)?;
+        check("coarse_size", "at least 1 pixel", self.coarse_size, self.coarse_size > 0)?;
         self.hold.check()
     }
 
@@ -356,9 +365,9 @@ mod tests {
         assert_eq!(config.clone().for_photos(usize::MAX), sixteen);
         sixteen.check().unwrap();
         // What is as large already stays.
-        let detailed = config.clone().detailed(2).for_photos(8);
+        let detailed = config.clone().detailed(2, 4000).for_photos(8);
         assert_eq!((detailed.steps, detailed.render_size, detailed.gaussians), (1000, Some(512), 16_384));
-        assert_eq!(config.clone().detailed(4).for_photos(16).render_size, Some(1024));
+        assert_eq!(config.clone().detailed(4, 4000).for_photos(16).render_size, Some(1024));
         let whole = RefineConfig { render_size: None, ..config };
         assert_eq!(whole.for_photos(8).render_size, None);
     }
@@ -367,16 +376,21 @@ mod tests {
     fn detail_is_size_and_gaussians_and_later_steps() {
         let config = RefineConfig::default();
         for detail in [0, 1] {
-            assert_eq!(config.clone().detailed(detail), config);
+            assert_eq!(config.clone().detailed(detail, 4000), config);
         }
-        let two = config.clone().detailed(2);
+        let two = config.clone().detailed(2, 512);
         assert_eq!((two.steps, two.gaussians, two.render_size, two.hold.weight), (500, 16_384, Some(512), 0.05));
-        let four = config.clone().detailed(4);
-        assert_eq!((four.steps, four.gaussians, four.render_size, four.coarse), (1000, 32_768, Some(1024), 0.6));
+        assert_eq!((two.coarse, two.coarse_size), (0.6, 256));
+        let four = config.clone().detailed(4, 4000);
+        assert_eq!((four.steps, four.gaussians, four.render_size, four.coarse_size), (1000, 32_768, Some(1024), 512));
         assert_eq!(four.hold.weight, 0.025);
         four.check().unwrap();
+        // No more than photos show.
+        assert_eq!(config.clone().detailed(4, 512), two);
+        assert_eq!(config.clone().detailed(4, 257), two);
+        assert_eq!(config.clone().detailed(4, 256), config);
         let whole = RefineConfig { render_size: None, ..config };
-        assert_eq!(whole.detailed(4).render_size, None);
+        assert_eq!(whole.detailed(4, 100).render_size, None);
     }
 
     #[test]
@@ -421,6 +435,7 @@ mod tests {
         refused(&|c| c.rates.mean = 0.0, "rates.mean");
         refused(&|c| c.final_mean_rate = f64::NAN, "final_mean_rate");
         refused(&|c| c.coarse = 1.5, "coarse");
+        refused(&|c| c.coarse_size = 0, "coarse_size");
         refused(&|c| c.hold.weight = -1.0, "hold.weight");
         refused(&|c| c.hold.views = 0, "hold.views");
         refused(&|c| c.hold.size = 8, "hold.size");

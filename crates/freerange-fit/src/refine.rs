@@ -8,7 +8,6 @@ use crate::{
     objective::Objective,
     views::Targets,
 };
-use freerange_camera::View;
 use freerange_splat::Cloud;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -41,8 +40,7 @@ pub fn refine<'a>(
     let seen = seen.into();
     let targets = Targets::new(seen.views, config.render_size)?;
     let first = (config.coarse * config.steps as f64) as usize;
-    let coarse =
-        (first > 0).then(|| Targets::new(seen.views, Some(half(seen.views, config.render_size)))).transpose()?;
+    let coarse = (first > 0).then(|| Targets::new(seen.views, Some(config.coarse_size))).transpose()?;
     let further = seen.outlines.len();
     let size = config.render_size.map_or(OUTLINES, |size| size.min(OUTLINES));
     let outlines = (further > 0).then(|| Targets::new(seen, Some(size))).transpose()?;
@@ -72,12 +70,6 @@ pub fn refine<'a>(
     };
     let of_step = |step| coarse.as_ref().filter(|_| step < first).unwrap_or(&targets);
     optimise(start, of_step, &fit, &mut rng, more, progress)
-}
-
-/// Half the longest side, in pixels, at which `views` are compared.
-fn half(views: &[View], most: Option<u32>) -> u32 {
-    let longest = views.iter().map(|view| view.camera.width.max(view.camera.height)).max().unwrap_or(1);
-    (most.map_or(longest, |most| most.min(longest)) / 2).max(1)
 }
 
 /// As many of `clouds` as `most` Gaussians allow, but the first in any case, in one place. Each Gaussian becomes what relocation

@@ -259,22 +259,22 @@ fn refining_helps_seen_and_unseen_views() {
     assert_eq!(refine(&start, &[], &views, &config, go).unwrap().len(), 60);
 }
 
-/// Coarse steps see what a refinement at half the size sees, and the others all there is.
+/// Coarse steps see what a refinement at their size sees, and the others all there is.
 #[test]
-fn refining_may_begin_at_half_the_size() {
+fn refining_may_begin_with_small_pictures() {
     let scene = ball(60, 21);
     let (start, views) = (disturbed(&scene, 22), ring(4, 64, &scene));
-    let refined = |coarse, render_size| {
+    let refined = |coarse, coarse_size, render_size| {
+        let (render_size, hold) = (Some(render_size), small_hold());
         let config =
-            RefineConfig { steps: 20, gaussians: 90, coarse, render_size, hold: small_hold(), ..Default::default() };
+            RefineConfig { steps: 20, gaussians: 90, coarse, coarse_size, render_size, hold, ..Default::default() };
         refine(&start, &[], &views, &config, go).unwrap()
     };
-    let (small, whole) = (refined(0.0, Some(32)), refined(0.0, Some(64)));
-    assert_eq!(refined(1.0, Some(64)).rows(), small.rows());
-    // The views have 64 pixels: as many as there are is what is halved.
-    assert_eq!(refined(1.0, Some(1000)).rows(), small.rows());
-    assert_eq!(refined(1.0, None).rows(), small.rows());
-    let both = refined(0.5, Some(64));
+    let (small, whole) = (refined(0.0, 1, 32), refined(0.0, 1, 64));
+    assert_eq!(refined(1.0, 32, 64).rows(), small.rows());
+    // The views have 64 pixels.
+    assert_eq!(refined(1.0, 1000, 64).rows(), whole.rows());
+    let both = refined(0.5, 32, 64);
     assert!(both.rows() != small.rows() && both.rows() != whole.rows());
 }
 

@@ -360,7 +360,8 @@ fn finished(
                 false => HoldConfig { weight: 0.3, views: 24, ..HoldConfig::default() },
             };
             let config = RefineConfig { steps, hold, seed, ..RefineConfig::default() };
-            let config = config.detailed(options.sample.detail).for_photos(placed.photos);
+            let sides = placed.canonical.iter().map(|view| view.image.width().max(view.image.height()));
+            let config = config.detailed(options.sample.detail, sides.max().unwrap_or(0)).for_photos(placed.photos);
             let fit = |p: &mut dyn FnMut(&FitProgress<'_>) -> _| refine(&plain, &members, placed.all(), &config, p);
             let refined = watched(Stage::Refine, i, place, tell, config.steps, fit)?;
             (refined, Some(to_user(&plain, place)))

@@ -94,7 +94,8 @@ pub struct Sampling {
     #[arg(long, value_name = "STEPS")]
     pub refine: Option<usize>,
     /// How fine the detail is that refinement looks for, 1 to 16: so many times 256 pixels, at which photos are compared, and
-    /// 8,192 Gaussians. More lowers LPIPS, and hardly changes PSNR, in more time; 1 is quickest [default: the checkpoint's].
+    /// 8,192 Gaussians, as far as the photos have these pixels. More lowers LPIPS, and hardly changes PSNR, in more time; 1 is
+    /// quickest [default: the checkpoint's].
     #[arg(long, value_name = "TIMES")]
     pub detail: Option<usize>,
     /// Begin that refinement with so many samples together, and hold it at their mean pictures; 1 is the sample alone [default: the checkpoint's].

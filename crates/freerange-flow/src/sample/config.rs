@@ -65,8 +65,8 @@ pub struct SampleConfig {
     /// Steps of 3DGS-MCMC on up to four input views that follow ([`freerange_fit::refine`]), of more views more
     /// ([`for_photos`](freerange_fit::RefineConfig::for_photos)); [`reconstruct`](super::reconstruct) itself takes none.
     pub refine: usize,
-    /// How fine the detail is that refinement looks for: so many times 256 pixels and 8,192 Gaussians, and less of a hold
-    /// ([`detailed`](freerange_fit::RefineConfig::detailed)).
+    /// How fine the detail is that refinement looks for: so many times 256 pixels and 8,192 Gaussians, and less of a hold, as far as
+    /// photos have these pixels ([`detailed`](freerange_fit::RefineConfig::detailed)).
     #[serde(skip_serializing_if = "is_usual")]
     pub detail: usize,
     /// How many samples refinement begins with and is held at the mean pictures of, each from a fit and noise of its own.
