@@ -57,7 +57,7 @@ pub struct JobOptions {
     pub seed: Option<u64>,
     /// Steps of refinement on the photos; the model's own where it is left out.
     pub refine: Option<usize>,
-    /// Times as fine a refinement; the model's own where it is left out.
+    /// How fine the detail is that refinement looks for; the model's own where it is left out.
     pub detail: Option<usize>,
     /// Steps of sampling; the model's own where it is left out.
     pub steps: Option<usize>,
