@@ -70,6 +70,49 @@ impl Objective {
         Ok(sum)
     }
 
+    /// `weight` times the mean, over the pixels of one view, of how far apart lies what is seen along their rays: the sum of `w (z - m)^2` over the
+    /// Gaussians that are blended there with the weights `w`, whose centres have the depths `z`, of weighted mean `m`. In squares of `radius`.
+    pub fn distortion(
+        cloud: &Cloud,
+        targets: &Targets,
+        view: usize,
+        radius: f64,
+        weight: f64,
+    ) -> Result<Self, FitError> {
+        let camera = targets.cameras[view];
+        // Depths from about the object's middle on: sums of their squares have to be told apart in f32.
+        let toward = camera.world_to_camera.row(2) / radius;
+        let [x, y, z] = [toward.x, toward.y, toward.z].map(|v| v as f32);
+        let depths: Vec<f32> = cloud.iter().map(|row| dot([x, y, z], &row[channel::MEAN])).collect();
+        // Depths and their squares in place of colours: what is drawn are their sums, weighted.
+        let mut moments = cloud.clone();
+        for (row, &depth) in moments.iter_mut().zip(&depths) {
+            row[channel::COLOR].copy_from_slice(&[depth, depth * depth, 0.0]);
+        }
+        let output = render(moments.rows(), &[camera], &[[0.0; 3]], targets.raster(view))?;
+        let share = (weight / output.alpha.len() as f64) as f32;
+        let (mut d_rgb, mut d_alpha) = (vec![0.0; output.rgb.len()], vec![0.0; output.alpha.len()]);
+        let sums = output.rgb.as_chunks::<3>().0.iter().zip(&output.alpha);
+        let gradients = d_rgb.as_chunks_mut::<3>().0.iter_mut().zip(&mut d_alpha);
+        let mut loss = 0.0;
+        // The sum of w z^2, less what it would be were all of it at the mean.
+        for (([first, second, _], &alpha), (d, d_alpha)) in sums.zip(gradients).filter(|((_, alpha), _)| **alpha > 0.0)
+        {
+            let mean = first / alpha;
+            loss += f64::from(share * (second - first * mean));
+            *d = [-2.0 * share * mean, share, 0.0];
+            *d_alpha = share * mean * mean;
+        }
+        let mut gradients = render_backward(moments.rows(), &output, &d_rgb, &d_alpha, &[])?.gaussians;
+        for (row, depth) in gradients.as_chunks_mut::<{ channel::COUNT }>().0.iter_mut().zip(depths) {
+            let [d_first, d_second, _] = std::array::from_fn(|c| row[channel::COLOR.start + c]);
+            let d_depth = d_first + 2.0 * depth * d_second;
+            row[channel::MEAN].iter_mut().zip([x, y, z]).for_each(|(g, v)| *g += d_depth * v);
+            row[channel::COLOR].fill(0.0);
+        }
+        Ok(Self { loss, gradients })
+    }
+
     /// Adds another one, of the same cloud.
     pub fn add(&mut self, other: &Self) {
         self.loss += other.loss;
@@ -178,6 +221,10 @@ fn each_row(
     sums.collect::<Vec<f64>>().iter().sum()
 }
 
+fn dot(a: [f32; 3], b: &[f32]) -> f32 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
+}
+
 /// Whether all are: without a branch per number, unlike `all`, so that vectors of them are looked at.
 fn finite(values: &[f32]) -> bool {
     const EXPONENT: u32 = 0x7f80_0000;
@@ -210,6 +257,8 @@ mod tests {
         hold::Hold,
         tests::{ball, ring},
     };
+    use freerange_camera::{Camera, View};
+    use glam::DVec3;
 
     /// The rectangle of differences gives what the whole image gives.
     #[test]
@@ -288,6 +337,47 @@ mod tests {
         // What agrees has nothing to learn but what rounding to bytes leaves.
         let own = outlines(&ball(12, 1), &[0, 1]);
         assert!(own.loss < 2e-3 && colored.loss > 10.0 * own.loss, "{} {}", own.loss, colored.loss);
+    }
+
+    #[test]
+    fn gradients_of_distortion_match_finite_differences() {
+        let views = [ring(1, 24, &ball(12, 1)).remove(0), ring(3, 40, &ball(12, 1)).remove(2)];
+        let targets = Targets::new(&views, Some(32)).unwrap();
+        for view in [0, 1] {
+            check_gradient(|cloud| Objective::distortion(cloud, &targets, view, 0.5, 3.0).unwrap());
+        }
+    }
+
+    /// Of two Gaussians along a ray it is `w1 w2 / (w1 + w2) (z1 - z2)^2`: weights by drawing each alone, depths by hand.
+    #[test]
+    fn distortion_is_what_lies_apart_along_rays() {
+        let camera = Camera::look_at(DVec3::new(0.0, -2.0, 0.0), DVec3::ZERO, DVec3::Z, 0.5, 16, 16);
+        let view = View { name: String::new(), camera, image: image::RgbaImage::new(16, 16) };
+        let targets = Targets::new(&[view], None).unwrap();
+        let gaussian = |y: f32, logit: f32, size: f32| {
+            let mut row = [0.0; channel::COUNT];
+            row[channel::MEAN].copy_from_slice(&[0.02, y, -0.03]);
+            row[channel::LOG_SCALE].fill(size.ln());
+            row[channel::ROTATION.start] = 1.0;
+            row[channel::LOGIT_OPACITY] = logit;
+            Cloud::from_rows(row.to_vec())
+        };
+        let (near, far) = (gaussian(-0.2, 0.4, 0.1), gaussian(0.15, 1.0, 0.2));
+        let alphas = |cloud: &Cloud| render(cloud.rows(), &[camera], &[[0.0; 3]], targets.raster(0)).unwrap().alpha;
+        let apart: f64 = alphas(&near)
+            .iter()
+            .zip(alphas(&far))
+            .map(|(&a, b)| {
+                let (first, second) = (f64::from(a), f64::from((1.0 - a) * b));
+                let sum = first + second;
+                if sum > 0.0 { first * second / sum * (0.35f64 / 0.5).powi(2) } else { 0.0 }
+            })
+            .sum();
+        let both = Cloud::from_rows([far.rows(), near.rows()].concat());
+        let found = |cloud: &Cloud| Objective::distortion(cloud, &targets, 0, 0.5, 2.0).unwrap().loss;
+        let expected = 2.0 * apart / 256.0;
+        assert!(expected > 1e-3 && (found(&both) - expected).abs() < 1e-3 * expected, "{} {expected}", found(&both));
+        assert!(found(&near).abs() < 1e-7 && found(&far).abs() < 1e-7);
     }
 
     fn check_gradient(value: impl Fn(&Cloud) -> Objective) {
