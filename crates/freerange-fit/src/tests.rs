@@ -277,7 +277,7 @@ fn what_lies_apart_along_rays_is_drawn_together() {
         (0..4).map(|view| Objective::distortion(&refined, &targets, view, 0.5, 1.0).unwrap().loss).sum::<f64>()
     };
     let (with, without) = (apart(5.0), apart(0.0));
-    assert!(with < 0.8 * without, "{with} with, {without} without");
+    assert!(with < 0.9 * without, "{with} with, {without} without");
 }
 
 /// Coarse steps see what a refinement at their size sees, and the others all there is.
