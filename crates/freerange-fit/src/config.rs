@@ -129,10 +129,6 @@ pub struct RefineConfig {
     pub coarse: f64,
     /// Longest side in pixels at which these steps compare views. Smaller views are compared as they are.
     pub coarse_size: u32,
-    /// Weight of what lies apart along the rays of the views: of Gaussians that show a view's print at different depths, each a little of it,
-    /// another view sees a smear. The variance of depth, in squares of [`HoldConfig::radius`]; 0: not looked at. After the distortion loss of Barron
-    /// et al., "Mip-NeRF 360" (CVPR 2022), and of Huang et al., "2D Gaussian Splatting" (SIGGRAPH 2024).
-    pub distortion: f64,
     /// What keeps the cloud where no view looks.
     pub hold: HoldConfig,
     /// Seed of everything drawn.
@@ -152,7 +148,6 @@ impl Default for RefineConfig {
             render_size: Some(256),
             coarse: 0.0,
             coarse_size: 256,
-            distortion: 5.0,
             hold: HoldConfig::default(),
             seed: 0,
         }
@@ -313,7 +308,6 @@ impl RefineConfig {
         check_render_size(self.render_size)?;
         fraction("coarse", self.coarse)?;
         check("coarse_size", "at least 1 pixel", self.coarse_size, self.coarse_size > 0)?;
-        finite_not_negative("distortion", self.distortion)?;
         self.hold.check()
     }
 

@@ -12,10 +12,6 @@ pub(crate) struct Objective {
     pub gradients: Vec<f32>, // [n, 14]
 }
 
-/// Variance of depth along a ray, in squares of the object's radius, from which on it rather tells of an edge, before and behind which there are
-/// surfaces, than of one surface that is not where it should be.
-const EDGE: f32 = 0.02;
-
 impl Objective {
     /// Mean over the `chosen` views of `(1 - lambda) L1 + lambda (1 - SSIM)`, all over one `background`.
     pub fn photometric(
@@ -72,53 +68,6 @@ impl Objective {
             sum.gradients.iter_mut().zip(gradients).for_each(|(sum, g)| *sum += g);
         }
         Ok(sum)
-    }
-
-    /// `weight` times the mean, over the pixels of one view, of how far apart lies what is seen along their rays: of the weighted variance `v` of the
-    /// depths of the Gaussians' centres, in squares of `radius`, with the weights with which they are blended there, alpha in all, it is
-    /// `alpha v / (1 + v / EDGE)`.
-    pub fn distortion(
-        cloud: &Cloud,
-        targets: &Targets,
-        view: usize,
-        radius: f64,
-        weight: f64,
-    ) -> Result<Self, FitError> {
-        let camera = targets.cameras[view];
-        // Depths from about the object's middle on: sums of their squares have to be told apart in f32.
-        let toward = camera.world_to_camera.row(2) / radius;
-        let [x, y, z] = [toward.x, toward.y, toward.z].map(|v| v as f32);
-        let depths: Vec<f32> = cloud.iter().map(|row| dot([x, y, z], &row[channel::MEAN])).collect();
-        // Depths and their squares in place of colours: what is drawn are their sums, weighted.
-        let mut moments = cloud.clone();
-        for (row, &depth) in moments.iter_mut().zip(&depths) {
-            row[channel::COLOR].copy_from_slice(&[depth, depth * depth, 0.0]);
-        }
-        let output = render(moments.rows(), &[camera], &[[0.0; 3]], targets.raster(view))?;
-        let share = (weight / output.alpha.len() as f64) as f32;
-        let (mut d_rgb, mut d_alpha) = (vec![0.0; output.rgb.len()], vec![0.0; output.alpha.len()]);
-        let sums = output.rgb.as_chunks::<3>().0.iter().zip(&output.alpha);
-        let gradients = d_rgb.as_chunks_mut::<3>().0.iter_mut().zip(&mut d_alpha);
-        let mut loss = 0.0;
-        for (([first, second, _], &alpha), (d, d_alpha)) in sums.zip(gradients).filter(|((_, alpha), _)| **alpha > 0.0)
-        {
-            let mean = first / alpha;
-            // Rounding may leave less than nothing.
-            let variance = (second / alpha - mean * mean).max(0.0);
-            let bent = 1.0 / (1.0 + variance / EDGE);
-            let (value, slope) = (share * variance * bent, share * bent * bent);
-            loss += f64::from(alpha * value);
-            *d = [-2.0 * slope * mean, slope, 0.0];
-            *d_alpha = value + slope * (mean * mean - variance);
-        }
-        let mut gradients = render_backward(moments.rows(), &output, &d_rgb, &d_alpha, &[])?.gaussians;
-        for (row, depth) in gradients.as_chunks_mut::<{ channel::COUNT }>().0.iter_mut().zip(depths) {
-            let [d_first, d_second, _] = std::array::from_fn(|c| row[channel::COLOR.start + c]);
-            let d_depth = d_first + 2.0 * depth * d_second;
-            row[channel::MEAN].iter_mut().zip([x, y, z]).for_each(|(g, v)| *g += d_depth * v);
-            row[channel::COLOR].fill(0.0);
-        }
-        Ok(Self { loss, gradients })
     }
 
     /// Adds another one, of the same cloud.
@@ -229,10 +178,6 @@ fn each_row(
     sums.collect::<Vec<f64>>().iter().sum()
 }
 
-fn dot(a: [f32; 3], b: &[f32]) -> f32 {
-    a.iter().zip(b).map(|(a, b)| a * b).sum()
-}
-
 /// Whether all are: without a branch per number, unlike `all`, so that vectors of them are looked at.
 fn finite(values: &[f32]) -> bool {
     const EXPONENT: u32 = 0x7f80_0000;
@@ -265,8 +210,6 @@ mod tests {
         hold::Hold,
         tests::{ball, ring},
     };
-    use freerange_camera::{Camera, View};
-    use glam::DVec3;
 
     /// The rectangle of differences gives what the whole image gives.
     #[test]
@@ -347,60 +290,8 @@ mod tests {
         assert!(own.loss < 2e-3 && colored.loss > 10.0 * own.loss, "{} {}", own.loss, colored.loss);
     }
 
-    #[test]
-    fn gradients_of_distortion_match_finite_differences() {
-        let views = [ring(1, 24, &ball(12, 1)).remove(0), ring(3, 40, &ball(12, 1)).remove(2)];
-        let targets = Targets::new(&views, Some(32)).unwrap();
-        // So near to each other that the variance is about what an edge has: far from there it changes by little but the rasteriser's cut-offs.
-        let mut near = ball(12, 3);
-        near.iter_mut().for_each(|row| row[channel::MEAN].iter_mut().for_each(|v| *v *= 0.3));
-        for view in [0, 1] {
-            check_gradient_at(&near, |cloud| Objective::distortion(cloud, &targets, view, 0.5, 3.0).unwrap());
-        }
-    }
-
-    /// Of two Gaussians along a ray the variance is `w1 w2 / (w1 + w2)^2 (z1 - z2)^2`: weights by drawing each alone, depths by hand.
-    #[test]
-    fn distortion_is_what_lies_apart_along_rays() {
-        let camera = Camera::look_at(DVec3::new(0.0, -2.0, 0.0), DVec3::ZERO, DVec3::Z, 0.5, 16, 16);
-        let view = View { name: String::new(), camera, image: image::RgbaImage::new(16, 16) };
-        let targets = Targets::new(&[view], None).unwrap();
-        let gaussian = |y: f32, logit: f32, size: f32| {
-            let mut row = [0.0; channel::COUNT];
-            row[channel::MEAN].copy_from_slice(&[0.02, y, -0.03]);
-            row[channel::LOG_SCALE].fill(size.ln());
-            row[channel::ROTATION.start] = 1.0;
-            row[channel::LOGIT_OPACITY] = logit;
-            Cloud::from_rows(row.to_vec())
-        };
-        let alphas = |cloud: &Cloud| render(cloud.rows(), &[camera], &[[0.0; 3]], targets.raster(0)).unwrap().alpha;
-        let found = |cloud: &Cloud| Objective::distortion(cloud, &targets, 0, 0.5, 2.0).unwrap().loss;
-        // One surface that is not where it should be, and two.
-        for distance in [0.04, 0.35] {
-            let (near, far) = (gaussian(-0.2, 0.4, 0.1), gaussian(distance - 0.2, 1.0, 0.2));
-            let expected: f64 = alphas(&near)
-                .iter()
-                .zip(alphas(&far))
-                .map(|(&a, b)| {
-                    let (first, second) = (f64::from(a), f64::from((1.0 - a) * b));
-                    let sum = first + second;
-                    let apart = f64::from(distance) / 0.5;
-                    let variance = if sum > 0.0 { first * second * (apart / sum).powi(2) } else { 0.0 };
-                    2.0 / 256.0 * sum * variance / (1.0 + variance / f64::from(EDGE))
-                })
-                .sum();
-            let both = found(&Cloud::from_rows([far.rows(), near.rows()].concat()));
-            assert!(expected > 1e-4 && (both - expected).abs() < 2e-3 * expected, "{both} {expected}");
-            assert!(found(&near).abs() < 1e-7 && found(&far).abs() < 1e-7);
-        }
-    }
-
     fn check_gradient(value: impl Fn(&Cloud) -> Objective) {
-        check_gradient_at(&ball(12, 3), value);
-    }
-
-    fn check_gradient_at(cloud: &Cloud, value: impl Fn(&Cloud) -> Objective) {
-        let mut cloud = cloud.clone();
+        let mut cloud = ball(12, 3);
         let gradients = value(&cloud).gradients;
         let largest = gradients.iter().fold(0.0f32, |m, g| m.max(g.abs()));
         assert!(largest > 0.0);

@@ -16,9 +16,6 @@ use std::ops::ControlFlow;
 /// Longest side, in pixels, of outlines. They come from guesses, which nobody vouches for to the pixel.
 const OUTLINES: u32 = 128;
 
-/// Longest side, in pixels, of the pictures in which what lies apart along a ray is told.
-const DISTORTION: u32 = 128;
-
 /// Improves a cloud's agreement with posed views, and shows more detail by more Gaussians.
 ///
 /// Few views say little of the rest of the object, and Gaussians that only they judge leave the object's surface. Hence a
@@ -26,8 +23,7 @@ const DISTORTION: u32 = 128;
 /// more view to agree with, though less. `others` are more clouds of the same object. These pictures are the mean of all:
 /// where guesses differ, their mean is nearer to the truth than most. For the same reason the refinement begins with as many
 /// of them in one place as there are to be Gaussians, each fainter, so that together they show about what one alone does.
-/// Outlines, where there are any, come beside the views at every other step, and at every step what lies [apart](RefineConfig::distortion) along the rays
-/// of one view: what few photos show could be anywhere along their rays, and photos alone would leave it there.
+/// Outlines, where there are any, come beside the views at every other step.
 /// `progress` hears of every step, and ends with what there is by `ControlFlow::Break`. The same input gives the same bytes.
 ///
 /// # Errors
@@ -46,9 +42,8 @@ pub fn refine<'a>(
     let first = (config.coarse * config.steps as f64) as usize;
     let coarse = (first > 0).then(|| Targets::new(seen.views, Some(config.coarse_size))).transpose()?;
     let further = seen.outlines.len();
-    let at_most = |most: u32| Some(config.render_size.map_or(most, |size| size.min(most)));
-    let distorted = (config.distortion > 0.0).then(|| Targets::new(seen.views, at_most(DISTORTION))).transpose()?;
-    let outlines = (further > 0).then(|| Targets::new(seen, at_most(OUTLINES))).transpose()?;
+    let size = config.render_size.map_or(OUTLINES, |size| size.min(OUTLINES));
+    let outlines = (further > 0).then(|| Targets::new(seen, Some(size))).transpose()?;
     let clouds = std::iter::once(cloud).chain(others).map(|cloud| checked(cloud, usize::MAX));
     let clouds = clouds.collect::<Result<Vec<_>, _>>()?;
     let hold = Hold::new(&clouds, &config.hold)?;
@@ -59,9 +54,7 @@ pub fn refine<'a>(
     // A stream of its own: the photos come in the same order with and without a hold.
     let mut hold_rng = ChaCha8Rng::seed_from_u64(config.seed);
     hold_rng.set_stream(1);
-    let mut distortion_rng = ChaCha8Rng::seed_from_u64(config.seed);
-    distortion_rng.set_stream(2);
-    let (mut queue, mut distortion_queue) = (Vec::new(), Vec::new());
+    let mut queue = Vec::new();
     // Photos have more to tell here than shape: outlines come beside them, at every other step.
     let (mut outline_queue, mut step) = (Vec::new(), 0);
     let more = |cloud: &Cloud, background| {
@@ -69,20 +62,11 @@ pub fn refine<'a>(
         let outlined = outlines.as_ref().filter(|_| step % 2 == 0);
         let outlined = outlined.map(|targets| (targets, next_views(&mut outline_queue, further, 1, &mut hold_rng)));
         let held = next_views(&mut queue, hold.views(), 1, &mut hold_rng);
-        let distorted = distorted.as_ref().map(|targets| {
-            let view = next_views(&mut distortion_queue, targets.views, 1, &mut distortion_rng)[0];
-            move || Objective::distortion(cloud, targets, view, config.hold.radius, config.distortion)
-        });
-        let (outlined, (held, distorted)) = rayon::join(
+        let (outlined, held) = rayon::join(
             || outlined.map(|(targets, chosen)| Objective::outlines(cloud, targets, &chosen)).transpose(),
-            || {
-                rayon::join(
-                    || held.first().map(|&view| hold.objective(cloud, view, background)).transpose(),
-                    || distorted.map(|objective| objective()).transpose(),
-                )
-            },
+            || held.first().map(|&view| hold.objective(cloud, view, background)).transpose(),
         );
-        Ok(outlined?.into_iter().chain(held?).chain(distorted?).collect())
+        Ok(outlined?.into_iter().chain(held?).collect())
     };
     let of_step = |step| coarse.as_ref().filter(|_| step < first).unwrap_or(&targets);
     optimise(start, of_step, &fit, &mut rng, more, progress)

@@ -1,7 +1,7 @@
 //! Fits of small scenes that the rasteriser itself has drawn, and what all tests share.
 
+use crate::views::Targets;
 use crate::*;
-use crate::{objective::Objective, views::Targets};
 use freerange_camera::{Camera, View};
 use freerange_raster::{RasterConfig, render};
 use freerange_splat::{Cloud, channel};
@@ -235,18 +235,13 @@ fn small_hold() -> HoldConfig {
     HoldConfig { size: 48, ..Default::default() }
 }
 
-/// What is strewn in a ball lies apart along most rays, and has to stay there.
-fn strewn() -> RefineConfig {
-    RefineConfig { distortion: 0.0, ..Default::default() }
-}
-
 #[test]
 fn refining_helps_seen_and_unseen_views() {
     let scene = ball(60, 21);
     let start = disturbed(&scene, 22);
     let views = ring(4, 64, &scene);
     let held_out: Vec<View> = cameras(6, 64, 0.5).iter().map(|c| photograph(&scene, c)).collect();
-    let config = RefineConfig { steps: 300, gaussians: 90, hold: small_hold(), ..strewn() };
+    let config = RefineConfig { steps: 300, gaussians: 90, hold: small_hold(), ..Default::default() };
     let mut seen = vec![];
     let refined = refine(&start, &[], &views, &config, |p| {
         seen.push((p.step, p.gaussians));
@@ -264,22 +259,6 @@ fn refining_helps_seen_and_unseen_views() {
     assert_eq!(refine(&start, &[], &views, &config, go).unwrap().len(), 60);
 }
 
-/// By so much that it cannot be chance.
-#[test]
-fn what_lies_apart_along_rays_is_drawn_together() {
-    let scene = ball(60, 21);
-    let start = disturbed(&scene, 22);
-    let views = ring(4, 64, &scene);
-    let targets = Targets::new(&views, Some(64)).unwrap();
-    let apart = |distortion| {
-        let config = RefineConfig { steps: 100, gaussians: 90, hold: small_hold(), distortion, ..Default::default() };
-        let refined = refine(&start, &[], &views, &config, go).unwrap();
-        (0..4).map(|view| Objective::distortion(&refined, &targets, view, 0.5, 1.0).unwrap().loss).sum::<f64>()
-    };
-    let (with, without) = (apart(5.0), apart(0.0));
-    assert!(with < 0.9 * without, "{with} with, {without} without");
-}
-
 /// Coarse steps see what a refinement at their size sees, and the others all there is.
 #[test]
 fn refining_may_begin_with_small_pictures() {
@@ -287,7 +266,8 @@ fn refining_may_begin_with_small_pictures() {
     let (start, views) = (disturbed(&scene, 22), ring(4, 64, &scene));
     let refined = |coarse, coarse_size, render_size| {
         let (render_size, hold) = (Some(render_size), small_hold());
-        let config = RefineConfig { steps: 20, gaussians: 90, coarse, coarse_size, render_size, hold, ..strewn() };
+        let config =
+            RefineConfig { steps: 20, gaussians: 90, coarse, coarse_size, render_size, hold, ..Default::default() };
         refine(&start, &[], &views, &config, go).unwrap()
     };
     let (small, whole) = (refined(0.0, 1, 32), refined(0.0, 1, 64));
@@ -308,8 +288,15 @@ fn clouds_are_refined_together() {
         let hold = small_hold();
         // Too slow to move anything.
         let rates = Rates { mean: 1e-9, scale: 0.0, rotation: 0.0, opacity: 0.0, color: 0.0 };
-        let config =
-            RefineConfig { steps: 1, growth_rounds: 0, gaussians, rates, final_mean_rate: 1e-9, hold, ..strewn() };
+        let config = RefineConfig {
+            steps: 1,
+            growth_rounds: 0,
+            gaussians,
+            rates,
+            final_mean_rate: 1e-9,
+            hold,
+            ..Default::default()
+        };
         refine(&start, others, &views, &config, go).unwrap()
     };
     let other = disturbed(&scene, 23);
@@ -344,7 +331,7 @@ fn a_hold_keeps_the_unseen_side() {
     let (photos, behind) = (from(0.0, &scene), from(std::f64::consts::PI, &start));
     let refined = |weight| {
         let hold = HoldConfig { weight, ..small_hold() };
-        refine(&start, &[], &photos, &RefineConfig { gaussians: 200, hold, ..strewn() }, go).unwrap()
+        refine(&start, &[], &photos, &RefineConfig { gaussians: 200, hold, ..Default::default() }, go).unwrap()
     };
     let (held, free) = (refined(0.5), refined(0.0));
     let gain = psnr(&held, &photos) - psnr(&start, &photos);
@@ -368,7 +355,7 @@ fn other_guesses_help_on_the_unseen_side() {
     let guesses: Vec<Cloud> = (32..36).map(|seed| disturbed(&scene, seed)).collect();
     let refined = |others: &[Cloud]| {
         let hold = HoldConfig { weight: 0.5, ..small_hold() };
-        refine(&guesses[0], others, &photos, &RefineConfig { gaussians: 200, hold, ..strewn() }, go).unwrap()
+        refine(&guesses[0], others, &photos, &RefineConfig { gaussians: 200, hold, ..Default::default() }, go).unwrap()
     };
     let (alone, together) = (psnr(&refined(&[]), &behind), psnr(&refined(&guesses[1..]), &behind));
     assert!(together > alone + 1.0, "{alone} dB alone, {together} dB together");
@@ -394,7 +381,7 @@ fn views_may_have_any_size() {
     let photos: Vec<View> = photos.iter().map(|c| photograph(&scene, c)).collect();
     let held_out: Vec<View> = cameras(6, 64, 0.5).iter().map(|c| photograph(&scene, c)).collect();
     let start = disturbed(&scene, 22);
-    let config = RefineConfig { steps: 300, gaussians: 90, hold: small_hold(), ..strewn() };
+    let config = RefineConfig { steps: 300, gaussians: 90, hold: small_hold(), ..Default::default() };
     let refined = refine(&start, &[], &photos, &config, go).unwrap();
     for views in [&photos, &held_out] {
         let (before, after) = (psnr(&start, views), psnr(&refined, views));

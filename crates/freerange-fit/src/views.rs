@@ -132,12 +132,7 @@ impl Targets {
     /// The views `chosen`, in groups that can be rendered together (one size, one blur), and how to render these.
     pub fn groups<'a>(&'a self, chosen: &'a [usize]) -> impl Iterator<Item = (&'a [usize], &'a RasterConfig)> {
         let kind = |i: usize| (self.images[i].dimensions(), self.rasters[i].blur.to_bits());
-        chosen.chunk_by(move |&a, &b| kind(a) == kind(b)).map(|group| (group, self.raster(group[0])))
-    }
-
-    /// How to render view `i`.
-    pub fn raster(&self, i: usize) -> &RasterConfig {
-        &self.rasters[i]
+        chosen.chunk_by(move |&a, &b| kind(a) == kind(b)).map(|group| (group, &self.rasters[group[0]]))
     }
 
     /// Width and height of view `i` in pixels.
