@@ -9,7 +9,7 @@ use freerange_camera::{
     plucker,
 };
 use freerange_data::{InputFit, Object};
-use freerange_model::{FreeRange, ModelConfig};
+use freerange_model::{FreeRange, ModelConfig, ModelKind, PLUCKER};
 use freerange_splat::{Cloud, Normalization, channel};
 use glam::DVec3;
 use rand::{Rng, SeedableRng, seq::SliceRandom};
@@ -59,6 +59,8 @@ pub struct Conditioning {
     pub images: Tensor<5>,
     /// `[b, views, rows, columns, 6]`, one ray per patch centre.
     pub plucker: Tensor<5>,
+    /// `[b, views, h, w, 6]`, one ray per pixel, for a pixel-aligned model.
+    pub rays: Option<Tensor<5>>,
 }
 
 impl Conditioning {
@@ -72,22 +74,32 @@ impl Conditioning {
         let size = config.image_size;
         let (channels, grid) = (config.image_channels(), config.patches_per_side());
         let views: Vec<&View> = objects.iter().flatten().copied().collect();
-        let (pixels, rays): (Vec<_>, Vec<_>) = views
+        let side = if config.kind == ModelKind::PixelAligned { size as usize } else { 0 };
+        let ((pixels, plucker_rays), rays): ((Vec<_>, Vec<_>), Vec<_>) = views
             .into_par_iter()
             .map(|view| {
                 let view = resized(&Window::around(view).cut(view), size, size);
                 let on_white = |p: &[f32; 4], c: usize| if c < 3 { p[c] * p[3] + 1.0 - p[3] } else { p[3] };
                 let all = to_f32_rgba(&view.image);
                 let pixels = all.as_chunks::<4>().0.iter().flat_map(|p| (0..channels).map(move |c| on_white(p, c)));
-                (pixels.collect::<Vec<f32>>(), plucker(&view.camera, grid, grid, PatchLayout::Scaled))
+                let rays = |side| plucker(&view.camera, side, side, PatchLayout::Scaled);
+                ((pixels.collect::<Vec<f32>>(), rays(grid)), rays(side))
             })
             .unzip();
-        let (pixels, rays) = (pixels.concat(), rays.concat());
         let size = size as usize;
+        let tensor = |values: Vec<Vec<f32>>, side: usize, channels: usize| {
+            Tensor::<5>::from_data(TensorData::new(values.concat(), [b, v, side, side, channels]), device)
+        };
         Ok(Self {
-            images: Tensor::from_data(TensorData::new(pixels, [b, v, size, size, channels]), device),
-            plucker: Tensor::from_data(TensorData::new(rays, [b, v, grid, grid, 6]), device),
+            images: tensor(pixels, size, channels),
+            plucker: tensor(plucker_rays, grid, PLUCKER),
+            rays: (side > 0).then(|| tensor(rays, side, PLUCKER)),
         })
+    }
+
+    /// The Gaussians of a model that predicts in one pass: see [`FreeRange::predict`]. `[b, n, 14]`
+    pub fn predict(self, model: &FreeRange) -> Tensor<3> {
+        model.predict(model.encode(self.images, self.plucker), self.rays)
     }
 
     /// The image tokens. `[b, views * rows * columns, features]`

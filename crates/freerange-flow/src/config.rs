@@ -4,7 +4,7 @@ use std::path::Path;
 
 use freerange_core::Invalid;
 use freerange_data::Making;
-use freerange_model::{Compute, ModelConfig};
+use freerange_model::{Compute, ModelConfig, ModelKind};
 
 use serde::{Deserialize, de::Error};
 
@@ -516,6 +516,7 @@ impl<M: Making> TrainConfig<M> {
         for (field, size) in [("loss.render_size", l.render_size), ("loss.gradient_size", l.gradient_size)] {
             check((8..=2048).contains(&size), field, "8 to 2048", size.to_string())?;
         }
+        self.validate_kind()?;
         let o = &self.optimizer;
         check(o.learning_rate > 0.0, "optimizer.learning_rate", "above 0", o.learning_rate.to_string())?;
         check((0.0..1.0).contains(&o.ema), "optimizer.ema", "0 to below 1", o.ema.to_string())?;
@@ -540,6 +541,36 @@ impl<M: Making> TrainConfig<M> {
         }
         if let Some(depth) = self.sample.depth {
             check((1usize << depth) >= p, "sample.depth", "at least one token", depth.to_string())?;
+        }
+        Ok(())
+    }
+
+    /// Refuses losses and sampling that a model of this kind does not have.
+    fn validate_kind(&self) -> Result<(), FlowError> {
+        let (kind, l) = (self.model.kind, &self.loss);
+        self.sample.validate_for(kind)?;
+        if !kind.one_pass() {
+            return Ok(());
+        }
+        let check = |ok: bool, field: &str, expected: &str, found: String| match ok {
+            true => Ok(()),
+            false => {
+                let expected = format!("{expected} for a {} model, which predicts in one pass", kind.name());
+                Err(FlowError::from(Invalid::new(field, expected, found)))
+            }
+        };
+        check(!l.flow, "loss.flow", "false", "true".into())?;
+        check(l.seen || (l.held && l.held_views > 0), "loss", "a rendering loss", "none".into())?;
+        check(l.unconditional == 0.0, "loss.unconditional", "0", l.unconditional.to_string())?;
+        check(!l.random_patches, "loss.random_patches", "false", "true".into())?;
+        check(l.coupling == Coupling::Independent, "loss.coupling", "independent", "tree".into())?;
+        check(l.start.is_none(), "loss.start", "none", "one".into())?;
+        if kind == ModelKind::LatentTokens {
+            let most = self.model.gaussians(0, 0);
+            for s in &self.stages {
+                let expected = format!("the depth of {most} Gaussians (model.latent_tokens)");
+                check(1usize << s.depth == most, "stage.depth", &expected, s.depth.to_string())?;
+            }
         }
         Ok(())
     }

@@ -111,6 +111,12 @@ pub(crate) fn is_path(place: &str) -> bool {
 fn merged(mut under: Table, over: Table) -> Table {
     for (key, value) in over {
         let value = match (under.remove(&key), value) {
+            // Encoders of two kinds have no fields in common.
+            (Some(Value::Table(a)), Value::Table(b))
+                if key == "encoder" && b.get("kind") != a.get("kind") && b.contains_key("kind") =>
+            {
+                Value::Table(b)
+            }
             (Some(Value::Table(a)), Value::Table(b)) => Value::Table(merged(a, b)),
             (_, value) => value,
         };
@@ -187,6 +193,83 @@ mod tests {
         );
         let error = sample("both.toml").unwrap_err().to_string();
         assert!(error.contains("both.toml") && error.contains("sample.guidance"), "{error}");
+    }
+
+    #[test]
+    fn an_encoder_of_another_kind_takes_nothing_of_its_parents() {
+        let text = "parent = \"paper\"\nmodel.image_size = 512\n";
+        let files = [
+            (
+                "patch.toml",
+                format!(
+                    "{text}model.encoder = {{ kind = \"patch\", channels = 3 }}\n[[stage]]\ndepth = 11\nimage_size = 512\nbatch = 1\nsteps = 1\n"
+                ),
+            ),
+            ("same.toml", "parent = \"tiny\"\nmodel.encoder = { kind = \"patch\", channels = 3 }\n".to_owned()),
+        ];
+        let files: Vec<(&str, &str)> = files.iter().map(|(a, b)| (*a, b.as_str())).collect();
+        let folder = place(&files);
+        let encoder = |name: &str| TrainConfig::load(&folder.path().join(name)).unwrap().model.encoder;
+        let patch = freerange_model::PatchConfig { channels: 3, ..Default::default() };
+        assert_eq!(encoder("patch.toml"), freerange_model::EncoderConfig::Patch(patch));
+        assert_eq!((encoder("same.toml").patch_size(), encoder("same.toml").channels()), (16, 3));
+    }
+
+    /// The rows of the paper's tables: one source of objects, as many samples, parameters within 5 % of Full's.
+    #[test]
+    fn rows_of_the_tables_differ_in_what_they_are_about_alone() {
+        let folder = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/tables"));
+        let load = |name: &str| TrainConfig::load(&folder.join(name)).unwrap();
+        let parameters =
+            |c: &TrainConfig| -> f64 { freerange_model::tensors(&c.model).iter().map(|t| t.count() as f64).sum() };
+        let samples = |c: &TrainConfig| c.stages.iter().map(|s| s.steps * s.batch as u64).sum::<u64>();
+        let full = load("full.toml");
+        assert_eq!(samples(&full), 40_000);
+        let mut rows = 0;
+        for entry in fs::read_dir(folder).unwrap() {
+            let name = entry.unwrap().file_name().into_string().unwrap();
+            let row = load(&name);
+            assert_eq!(samples(&row), samples(&full), "{name}");
+            assert_eq!((&row.data, &row.optimizer), (&full.data, &full.optimizer), "{name}");
+            let ratio = parameters(&row) / parameters(&full);
+            assert!((0.95..1.05).contains(&ratio), "{name}: {ratio} times the parameters of Full");
+            rows += 1;
+        }
+        assert!(rows >= 12, "{rows}");
+        for (name, few) in [
+            ("full_seed2.toml", &[".seed"] as &[&str]),
+            ("no_rendering.toml", &[".loss.held", ".loss.seen"]),
+            ("no_curriculum.toml", &[".stage"]),
+            ("no_patching.toml", &[".model.gaussians_per_token"]),
+            ("no_patching_half.toml", &[".model.gaussians_per_token", ".stage"]),
+            ("random_patches.toml", &[".loss.random_patches"]),
+            ("no_gradient_channels.toml", &[".model.gradient_channels"]),
+            ("tree_coupling.toml", &[".loss.coupling", ".sample.coupling"]),
+        ] {
+            let json = |c: &TrainConfig| serde_json::to_value(c).unwrap();
+            assert_eq!(differences(&json(&full), &json(&load(name)), ""), few, "{name}");
+        }
+    }
+
+    #[test]
+    fn baselines_of_other_sizes_can_be_built() {
+        let folder = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs"));
+        let load = |name: &str| TrainConfig::load(&folder.join(name)).unwrap().model;
+        let millions = |model: &freerange_model::ModelConfig| {
+            freerange_model::tensors(model).iter().map(|t| t.count() as f64).sum::<f64>() / 1e6
+        };
+        let (base, paper) = (millions(&load("base.toml")), millions(&load("paper.toml")));
+        for (name, expected) in [
+            ("baselines/no_flow_base.toml", base),
+            ("baselines/pixel_aligned_base.toml", base),
+            ("baselines/voxel_aligned_base.toml", base),
+            ("baselines/no_flow_paper.toml", paper),
+            ("gs_lrm.toml", 300.0), // as that paper says
+        ] {
+            let found = millions(&load(name));
+            assert!((found / expected - 1.0).abs() < 0.05, "{name}: {found} M, expected {expected} M");
+        }
+        assert_eq!(load("lara.toml").gaussians(0, 4), 2 * 64usize.pow(3));
     }
 
     #[test]

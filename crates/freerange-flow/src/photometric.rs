@@ -2,7 +2,7 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use freerange_camera::{Camera, View, image_ops::to_f32_rgba};
-use freerange_model::OBSERVATION;
+use freerange_model::{ModelKind, OBSERVATION};
 use freerange_raster::{RasterConfig, rasterize};
 use freerange_splat::{Normalization, channel};
 use rayon::prelude::*;
@@ -99,10 +99,22 @@ impl Photometric {
         normalized * self.std.clone() + self.mean.clone()
     }
 
-    /// L1 between the renders of `normalized` (`[b, n, 14]`) and the targets: the mean over views, pixels and channels
-    /// for each object. Returns `[b]`.
+    /// Raw channels of what a model of this kind predicts in one pass. `[b, n, 14]`
+    pub fn raw(&self, kind: ModelKind, predicted: Tensor<3>) -> Tensor<3> {
+        match kind {
+            ModelKind::PixelAligned | ModelKind::VoxelAligned => predicted,
+            ModelKind::FlowMatching | ModelKind::LatentTokens => self.denormalize(predicted),
+        }
+    }
+
+    /// L1 between the renders of `normalized` (`[b, n, 14]`) and the targets: see [`l1_raw`](Self::l1_raw). Returns `[b]`.
     pub fn l1(&self, normalized: Tensor<3>, targets: &Targets) -> Result<Tensor<1>, FlowError> {
-        let gaussians = self.denormalize(normalized);
+        self.l1_raw(self.denormalize(normalized), targets)
+    }
+
+    /// L1 between the renders of Gaussians that are not normalized (`[b, n, 14]`) and the targets: the mean over views,
+    /// pixels and channels for each object. Returns `[b]`.
+    pub fn l1_raw(&self, gaussians: Tensor<3>, targets: &Targets) -> Result<Tensor<1>, FlowError> {
         let [_, _, h, w, _] = targets.images.dims();
         let raster = RasterConfig::default().shrunk(h.max(w) as f32 / VIEWER_SIZE);
         let render = rasterize(gaussians, &targets.cameras, &targets.backgrounds, &raster)?; // [b, v, h, w, 4]

@@ -10,6 +10,7 @@ use std::ops::ControlFlow;
 use burn::tensor::{Device, Tensor};
 use freerange_camera::View;
 pub use freerange_core::Background;
+use freerange_core::Invalid;
 use freerange_model::Checkpoint;
 use freerange_splat::{Cloud, channel};
 
@@ -22,7 +23,7 @@ use self::{
     drawn::{Drawn, Start},
     sampler::Sampler,
 };
-use crate::{FlowError, photometric::Photometric};
+use crate::{FlowError, batch::Conditioning, photometric::Photometric};
 
 /// Draws one sample of Gaussians per object and seed that fits the object's posed images. The whole of Section 3.5.
 ///
@@ -44,20 +45,19 @@ pub fn reconstruct(
     mut progress: impl FnMut(&Estimate<'_>) -> ControlFlow<()>,
 ) -> Result<Vec<Vec<Cloud>>, FlowError> {
     config.validate()?;
+    config.validate_for(checkpoint.config.kind)?;
     if objects.is_empty() || seeds.is_empty() {
         return Ok(vec![Vec::new(); objects.len()]);
+    }
+    if checkpoint.config.kind.one_pass() {
+        return one_pass(checkpoint, objects, config, seeds, device, progress);
     }
     let start = config.start.as_ref().map(|start| Start::new(start, fits, objects.len(), seeds.len())).transpose()?;
     let drawn = Drawn::new(checkpoint, config, start, objects.len(), seeds, device)?;
     let sampler = Sampler::new(checkpoint, objects, config, seeds.len(), &drawn, device)?;
     let guide = |step: &Step, estimate: &Tensor<3>| {
-        let told = Estimate {
-            index: step.index,
-            t: step.t,
-            normalized: estimate,
-            photometric: &sampler.photometric,
-            seeds: seeds.len(),
-        };
+        let raw = sampler.photometric.denormalize(estimate.clone());
+        let told = Estimate { index: step.index, t: step.t, raw: &raw, seeds: seeds.len() };
         match progress(&told) {
             ControlFlow::Break(()) => Err(FlowError::Cancelled),
             ControlFlow::Continue(()) => sampler.displacement(step, estimate),
@@ -69,6 +69,29 @@ pub fn reconstruct(
     clouds(sampler.photometric.denormalize(found), seeds.len())
 }
 
+/// The Gaussians of a model that predicts in one pass. There is nothing to draw: one seed is all there is.
+fn one_pass(
+    checkpoint: &Checkpoint,
+    objects: &[&[View]],
+    config: &SampleConfig,
+    seeds: &[u64],
+    device: &Device,
+    mut progress: impl FnMut(&Estimate<'_>) -> ControlFlow<()>,
+) -> Result<Vec<Vec<Cloud>>, FlowError> {
+    if seeds.len() > 1 {
+        let kind = checkpoint.config.kind.name();
+        return Err(Invalid::new("seeds", format!("one: a {kind} model has one answer"), seeds.len()).into());
+    }
+    let model = checkpoint.model.clone().with_compute(config.compute);
+    let views: Vec<Vec<&View>> = objects.iter().map(|o| o.iter().collect()).collect();
+    let predicted = Conditioning::new(&views, &checkpoint.config, device)?.predict(&model);
+    let raw = Photometric::new(&checkpoint.normalization, device).raw(model.kind(), predicted);
+    match progress(&Estimate { index: 0, t: 0.0, raw: &raw, seeds: 1 }) {
+        ControlFlow::Break(()) => Err(FlowError::Cancelled),
+        ControlFlow::Continue(()) => clouds(raw, 1),
+    }
+}
+
 /// What the network takes the clean Gaussians to be, after a step of sampling.
 #[derive(Clone, Copy, Debug)]
 pub struct Estimate<'a> {
@@ -76,8 +99,7 @@ pub struct Estimate<'a> {
     pub index: usize,
     /// The time that the step began at.
     pub t: f32,
-    normalized: &'a Tensor<3>, // [b, n, 14]
-    photometric: &'a Photometric,
+    raw: &'a Tensor<3>, // [b, n, 14]
     seeds: usize,
 }
 
@@ -87,7 +109,7 @@ impl Estimate<'_> {
     /// # Errors
     /// If the values cannot be read back.
     pub fn clouds(&self) -> Result<Vec<Vec<Cloud>>, FlowError> {
-        clouds(self.photometric.denormalize(self.normalized.clone()), self.seeds)
+        clouds(self.raw.clone(), self.seeds)
     }
 }
 

@@ -183,7 +183,8 @@ impl Validation {
             let mut psnr = Vec::new();
             for (inputs, others, fit) in self.tasks(object, config, *number) {
                 // The size that objects come in is the size that they are sampled and compared at.
-                let sample = SampleConfig { depth: Some(stage.depth), ..config.sample.clone() };
+                let depth = (!config.model.kind.one_pass()).then_some(stage.depth);
+                let sample = SampleConfig { depth, ..config.sample.clone() };
                 let fits = fit.map(|fit| [fit]);
                 let fits = fits.as_ref().map(<[Cloud; 1]>::as_slice);
                 let found = reconstruct(checkpoint, &[&inputs], fits, &sample, &[self.seed], device, |_| {

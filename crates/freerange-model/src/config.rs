@@ -8,15 +8,78 @@ use crate::ModelError;
 pub const CHANNELS: usize = freerange_splat::channel::COUNT;
 /// Channels of a Plücker ray: moment, direction.
 pub const PLUCKER: usize = 6;
+/// Channels of a pixel-aligned Gaussian before decoding: distance, scales, rotation, opacity, color.
+pub(crate) const PIXEL_CHANNELS: usize = 1 + 3 + 4 + 1 + 3;
+/// Most Gaussians of one object that a volume may have.
+const MOST_GAUSSIANS: usize = 1 << 24;
 /// Channels per Gaussian of what the input views show of it.
 pub const OBSERVATION: usize = 9;
 /// Channels per Gaussian of where it lies with respect to what the input views show.
 pub const PLACE: usize = 23;
 
+/// What the transformer's tokens stand for, and how Gaussians come out of them.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ModelKind {
+    /// Flow matching over the Gaussians themselves: the paper's model.
+    #[default]
+    FlowMatching,
+    /// Learned latent tokens instead of noise, one pass, no time: "No Flow Matching" in the paper's Table 3.
+    LatentTokens,
+    /// One pass in which every pixel of the input views becomes a Gaussian on its ray (GS-LRM, Zhang et al. 2024).
+    PixelAligned,
+    /// One pass from a learned volume of tokens, each cell with a few Gaussians near it (LaRa, Chen et al. 2024).
+    VoxelAligned,
+}
+
+impl ModelKind {
+    /// Whether the model predicts Gaussians in one pass: no noise, no time, nothing fed back.
+    pub fn one_pass(self) -> bool {
+        self != Self::FlowMatching
+    }
+
+    /// As configurations name it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::FlowMatching => "flow_matching",
+            Self::LatentTokens => "latent_tokens",
+            Self::PixelAligned => "pixel_aligned",
+            Self::VoxelAligned => "voxel_aligned",
+        }
+    }
+}
+
+/// The learned volume of a [voxel-aligned](ModelKind::VoxelAligned) model. It covers the canonical object, a sphere of
+/// radius 0.5, with a margin.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct VolumeConfig {
+    /// Tokens along a side of the volume.
+    pub tokens_per_side: usize,
+    /// Cells along a side of each token's share of the volume.
+    pub cells_per_token_side: usize,
+    /// Gaussians per cell.
+    pub gaussians_per_cell: usize,
+}
+
+impl VolumeConfig {
+    /// Tokens of the whole volume.
+    pub fn tokens(&self) -> usize {
+        self.tokens_per_side.pow(3)
+    }
+
+    /// Gaussians of each token.
+    pub fn gaussians_per_token(&self) -> usize {
+        self.cells_per_token_side.pow(3) * self.gaussians_per_cell
+    }
+}
+
 /// Sizes of the whole network. The defaults are the paper's.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ModelConfig {
+    /// What tokens stand for.
+    pub kind: ModelKind,
     /// Side of the square input images in pixels; a multiple of the encoder's patch.
     pub image_size: u32,
     /// How images become tokens.
@@ -34,6 +97,10 @@ pub struct ModelConfig {
     pub registers: usize,
     /// How many neighbours in the tree's order share one token: 1, 2, 4 or 8.
     pub gaussians_per_token: usize,
+    /// Learned tokens of a [`LatentTokens`](ModelKind::LatentTokens) model, which asks for them; 0 for every other kind.
+    pub latent_tokens: usize,
+    /// The volume of a [`VoxelAligned`](ModelKind::VoxelAligned) model, which asks for it; none for every other kind.
+    pub volume: Option<VolumeConfig>,
     /// Width of the sinusoidal embedding of the time; even.
     pub time_features: usize,
     /// Width of the sinusoidal embedding of a patch's position; a multiple of 4.
@@ -130,6 +197,7 @@ pub enum FinalLayer {
 impl Default for ModelConfig {
     fn default() -> Self {
         Self {
+            kind: ModelKind::FlowMatching,
             image_size: 518,
             encoder: EncoderConfig::Dinov2(Dinov2Config::default()),
             hidden: 1024,
@@ -138,6 +206,8 @@ impl Default for ModelConfig {
             ffn: None,
             registers: 32,
             gaussians_per_token: 2,
+            latent_tokens: 0,
+            volume: None,
             time_features: 256,
             position_features: 32,
             final_layer: FinalLayer::Adaln,
@@ -294,9 +364,54 @@ impl ModelConfig {
         }
     }
 
+    /// Gaussians that come out for `views` images, where a flow-matching model is asked for `2^depth`.
+    pub fn gaussians(&self, depth: u32, views: usize) -> usize {
+        match self.kind {
+            ModelKind::FlowMatching => 1 << depth,
+            ModelKind::LatentTokens => self.latent_tokens * self.gaussians_per_token,
+            ModelKind::PixelAligned => views * (self.image_size as usize).pow(2),
+            ModelKind::VoxelAligned => self.volume.map_or(0, |v| v.tokens() * v.gaussians_per_token()),
+        }
+    }
+
+    /// Channels of each token that leaves the transformer.
+    pub fn output_channels(&self) -> usize {
+        match self.kind {
+            ModelKind::FlowMatching | ModelKind::LatentTokens => self.gaussians_per_token * CHANNELS,
+            ModelKind::PixelAligned => (self.encoder.patch_size() as usize).pow(2) * PIXEL_CHANNELS,
+            ModelKind::VoxelAligned => self.volume.map_or(0, |v| v.gaussians_per_token()) * CHANNELS,
+        }
+    }
+
+    /// Learned tokens in the place of Gaussian tokens: latent tokens, or those of a volume.
+    pub fn learned_tokens(&self) -> usize {
+        match self.kind {
+            ModelKind::FlowMatching | ModelKind::PixelAligned => 0,
+            ModelKind::LatentTokens => self.latent_tokens,
+            ModelKind::VoxelAligned => self.volume.map_or(0, |v| v.tokens()),
+        }
+    }
+
+    /// Tokens that become Gaussians, for `views` images and `gaussians` Gaussians.
+    pub fn output_tokens(&self, views: usize, gaussians: usize) -> usize {
+        match self.kind {
+            ModelKind::FlowMatching => gaussians / self.gaussians_per_token,
+            ModelKind::PixelAligned => self.image_tokens(views),
+            ModelKind::LatentTokens | ModelKind::VoxelAligned => self.learned_tokens(),
+        }
+    }
+
+    pub(crate) fn image_tokens(&self, views: usize) -> usize {
+        views * self.patches_per_side().pow(2)
+    }
+
     /// Tokens in the transformer for `views` images and `gaussians` Gaussians.
     pub fn tokens(&self, views: usize, gaussians: usize) -> usize {
-        self.registers + views * self.patches_per_side().pow(2) + gaussians / self.gaussians_per_token
+        let others = match self.kind {
+            ModelKind::PixelAligned => 0, // image tokens themselves become Gaussians
+            _ => self.output_tokens(views, gaussians),
+        };
+        self.registers + self.image_tokens(views) + others
     }
 
     /// Checks every size; anything this accepts can be built, given the memory.
@@ -335,6 +450,7 @@ impl ModelConfig {
                 self.place_channels,
             ));
         }
+        self.validate_kind()?;
         match &self.encoder {
             EncoderConfig::Patch(c) => {
                 within("encoder.patch_size", c.patch_size as usize, 1, 256)?;
@@ -347,6 +463,33 @@ impl ModelConfig {
         if !self.image_size.is_multiple_of(self.encoder.patch_size()) {
             let expected = format!("a multiple of the encoder's patch size {}", self.encoder.patch_size());
             return Err(ModelError::config("image_size", expected, self.image_size));
+        }
+        Ok(())
+    }
+}
+
+impl ModelConfig {
+    /// Refuses parts that this kind of model does not have.
+    fn validate_kind(&self) -> Result<(), ModelError> {
+        let kind = self.kind.name();
+        let only = |field: &'static str, there: bool, wanted: bool| match (there, wanted) {
+            (true, false) => Err(ModelError::config(field, format!("none with kind = \"{kind}\""), "one")),
+            (false, true) => Err(ModelError::config(field, format!("one with kind = \"{kind}\""), "none")),
+            _ => Ok(()),
+        };
+        only("latent_tokens", self.latent_tokens > 0, self.kind == ModelKind::LatentTokens)?;
+        within("latent_tokens", self.latent_tokens, 0, 1 << 20)?;
+        only("volume", self.volume.is_some(), self.kind == ModelKind::VoxelAligned)?;
+        if let Some(VolumeConfig { tokens_per_side, cells_per_token_side, gaussians_per_cell }) = self.volume {
+            within("volume.tokens_per_side", tokens_per_side, 1, 64)?;
+            within("volume.cells_per_token_side", cells_per_token_side, 1, 8)?;
+            within("volume.gaussians_per_cell", gaussians_per_cell, 1, 64)?;
+            within("volume (Gaussians of all its cells)", self.gaussians(0, 0), 1, MOST_GAUSSIANS)?;
+        }
+        if self.kind.one_pass() {
+            only("gradient_channels", self.gradient_channels, false)?;
+            only("estimate_channels", self.estimate_channels, false)?;
+            only("preconditioning", self.preconditioning.is_some(), false)?;
         }
         Ok(())
     }

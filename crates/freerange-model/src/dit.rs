@@ -10,7 +10,7 @@ use burn::{
 
 use crate::{
     ModelConfig, ModelError,
-    config::{CHANNELS, FinalLayer, PLACE},
+    config::{CHANNELS, FinalLayer, ModelKind, PLACE},
     kernels::block::BlockSettings,
     layers::{Builder, Init, Linear, NormWeight, Source},
     ops::{self, Compute},
@@ -21,8 +21,9 @@ use crate::{
 pub struct Dit {
     registers: Param<Tensor<2>>, // [registers, d]
     img_in: Linear,
-    gs_in: Linear,
-    t_mlp: TimeMlp,
+    gs_in: Option<Linear>, // of flow matching, as is the time
+    t_mlp: Option<TimeMlp>,
+    latents: Option<Param<Tensor<2>>>, // learned tokens instead, [tokens, d]
     blocks: Vec<Block>,
     output: Output,
     gaussians_per_token: usize,
@@ -66,7 +67,8 @@ impl From<Option<Tensor<3>>> for Feedback {
 /// One transformer block.
 #[derive(Module, Debug)]
 pub(crate) struct Block {
-    adaln: Linear,
+    adaln: Option<Linear>,
+    norms: Option<Param<Tensor<2>>>, // without a time: learned shift and scale of both norms, [4, d]; gates are 1
     attn: Attention,
     ffn: FeedForward,
 }
@@ -89,6 +91,7 @@ struct FeedForward {
 #[derive(Module, Debug)]
 struct Output {
     adaln: Option<Linear>,
+    norm: Option<Param<Tensor<2>>>, // without a time: learned shift and scale, [2, d]
     linear: Linear,
 }
 
@@ -113,7 +116,14 @@ impl Block {
         let (d, f) = (config.hidden, config.ffn_width());
         let name = |part: &str| format!("{name}.{part}");
         Ok(Self {
-            adaln: builder.linear(&name("adaln"), d, 6 * d, Init::Zeros)?,
+            adaln: match config.kind.one_pass() {
+                false => Some(builder.linear(&name("adaln"), d, 6 * d, Init::Zeros)?),
+                true => None,
+            },
+            norms: match config.kind.one_pass() {
+                false => None,
+                true => Some(builder.param(&name("norms"), [4, d], Init::Zeros)?),
+            },
             attn: Attention {
                 qkv: builder.linear(&name("attn.qkv"), d, 3 * d, Init::Xavier)?,
                 q_norm: builder.norm_weight(&name("attn.q_norm"), config.head_width())?,
@@ -126,6 +136,18 @@ impl Block {
                 proj_out: builder.linear(&name("ffn.proj_out"), f, d, Init::Xavier)?,
             },
         })
+    }
+
+    /// Shift, scale and gate of attention, then of the feed-forward network: `[b, 6 d]`, from `[b, d]`.
+    fn modulation(&self, silu_c: Tensor<2>) -> Tensor<2> {
+        if let Some(adaln) = &self.adaln {
+            return adaln.forward(silu_c);
+        }
+        let norms = self.norms.as_ref().expect("built with either").val(); // [4, d]
+        let [b, d] = [silu_c.dims()[0], norms.dims()[1]];
+        let gate = Tensor::ones([1, d], &norms.device());
+        let half = |i: usize| norms.clone().narrow(0, i, 2);
+        Tensor::cat(vec![half(0), gate.clone(), half(2), gate], 0).reshape([1, 6 * d]).repeat_dim(0, b)
     }
 
     /// `x` `[b, t, d]`, `silu_c` `[b, d]`; returns the last `queries` tokens, `[b, queries, d]`.
@@ -142,7 +164,7 @@ impl Block {
         let settings = BlockSettings { heads: *heads, queries, compute, recompute };
         let matrices = [&qkv.weight, &out.weight, &proj_in.weight, &proj_out.weight].map(|w| w.val());
         let vectors = [&qkv.bias, &q_norm.weight, &k_norm.weight, &out.bias, &proj_in.bias, &proj_out.bias];
-        ops::dit_block(x, self.adaln.forward(silu_c), matrices, vectors.map(|w| w.val()), settings)
+        ops::dit_block(x, self.modulation(silu_c), matrices, vectors.map(|w| w.val()), settings)
     }
 
     /// The weights of both norms of the attention.
@@ -154,7 +176,7 @@ impl Block {
     pub(crate) fn forward_by_parts(&self, x: Tensor<3>, silu_c: Tensor<2>, queries: usize, parts: &Parts) -> Tensor<3> {
         let [_, tokens, _] = x.dims();
         let linear = |layer: &Linear, x: Tensor<3>| (parts.linear)(x, layer.weight.val(), layer.bias.val());
-        let [shift_a, scale_a, gate_a, shift_f, scale_f, gate_f] = chunks(self.adaln.forward(silu_c));
+        let [shift_a, scale_a, gate_a, shift_f, scale_f, gate_f] = chunks(self.modulation(silu_c));
         let Attention { qkv, q_norm, k_norm, out, heads } = &self.attn;
         let y = linear(qkv, (parts.norm)(x.clone(), shift_a, scale_a)); // [b, t, 3 d]
         let y = (parts.attention)(y, q_norm.weight.val(), k_norm.weight.val(), *heads, queries);
@@ -244,20 +266,36 @@ impl Dit {
         Ok(Self {
             registers: builder.param(&name("registers"), [config.registers, d], Init::Normal(0.02))?,
             img_in: builder.linear(&name("img_in"), image_channels, d, Init::Xavier)?,
-            gs_in: builder.linear(&name("gs_in"), config.gaussian_channels(), d, Init::Xavier)?,
-            t_mlp: TimeMlp {
-                first: builder.linear(&name("t_mlp.0"), config.time_features, d, Init::Normal(0.02))?,
-                second: builder.linear(&name("t_mlp.2"), d, d, Init::Normal(0.02))?,
+            gs_in: match config.kind {
+                ModelKind::FlowMatching => {
+                    Some(builder.linear(&name("gs_in"), config.gaussian_channels(), d, Init::Xavier)?)
+                }
+                _ => None,
+            },
+            t_mlp: match config.kind {
+                ModelKind::FlowMatching => Some(TimeMlp {
+                    first: builder.linear(&name("t_mlp.0"), config.time_features, d, Init::Normal(0.02))?,
+                    second: builder.linear(&name("t_mlp.2"), d, d, Init::Normal(0.02))?,
+                }),
+                _ => None,
+            },
+            latents: match config.learned_tokens() {
+                0 => None,
+                tokens => Some(builder.param(&name("latents"), [tokens, d], Init::Normal(1.0))?),
             },
             blocks: (0..config.blocks)
                 .map(|i| Block::build(config, &format!("{prefix}blocks.{i}"), builder))
                 .collect::<Result<_, ModelError>>()?,
             output: Output {
-                adaln: match config.final_layer {
-                    FinalLayer::Adaln => Some(builder.linear(&name("final.adaln"), d, 2 * d, Init::Zeros)?),
-                    FinalLayer::Linear => None,
+                adaln: match (config.final_layer, config.kind.one_pass()) {
+                    (FinalLayer::Adaln, false) => Some(builder.linear(&name("final.adaln"), d, 2 * d, Init::Zeros)?),
+                    _ => None,
                 },
-                linear: builder.linear(&name("final.linear"), d, config.gaussians_per_token * CHANNELS, Init::Zeros)?,
+                norm: match (config.final_layer, config.kind.one_pass()) {
+                    (FinalLayer::Adaln, true) => Some(builder.param(&name("final.norm"), [2, d], Init::Zeros)?),
+                    _ => None,
+                },
+                linear: builder.linear(&name("final.linear"), d, config.output_channels(), Init::Zeros)?,
             },
             gaussians_per_token: config.gaussians_per_token,
             gradient_channels: config.gradient_channels,
@@ -312,7 +350,8 @@ impl Dit {
     /// The same network with [`PLACE`] more channels of this kind, of which it knows nothing yet.
     pub(crate) fn with_place_channels(mut self) -> Self {
         let p = self.gaussians_per_token;
-        self.gs_in.weight = self.gs_in.weight.map(|weight| {
+        let gs_in = self.gs_in.as_mut().expect("a model of flow matching");
+        gs_in.weight = gs_in.weight.clone().map(|weight| {
             let [d, columns] = weight.dims();
             let weight = weight.reshape([d, p, columns / p]); // those of what views show are last
             let none = Tensor::zeros([d, p, PLACE], &weight.device());
@@ -323,8 +362,12 @@ impl Dit {
     }
 
     /// The conditioning vector of the time: `t` `[b]` in 0..1 to `[b, d]`.
+    ///
+    /// # Panics
+    /// If the model predicts in one pass: it has no time.
     pub fn condition(&self, t: Tensor<1>) -> Tensor<2> {
-        self.t_mlp.second.forward(silu(self.t_mlp.first.forward(time_embedding(t, self.time_features))))
+        let TimeMlp { first, second } = self.t_mlp.as_ref().expect("a model of flow matching");
+        second.forward(silu(first.forward(time_embedding(t, self.time_features))))
     }
 
     /// The sequence before the first block: registers, image tokens, Gaussian tokens. `[b, t, d]`
@@ -347,7 +390,13 @@ impl Dit {
         }
         let gaussians = Tensor::cat(gaussians, 2);
         let width = gaussians.dims()[2] * p;
-        let gaussians = self.gs_in.forward(gaussians.reshape([b, n / p, width]));
+        let gs_in = self.gs_in.as_ref().expect("a model of flow matching");
+        self.sequence(image_tokens, Some(gs_in.forward(gaussians.reshape([b, n / p, width]))))
+    }
+
+    /// Registers, image tokens, and the tokens that become Gaussians where these are others. `[b, t, d]`
+    fn sequence(&self, image_tokens: Tensor<3>, others: Option<Tensor<3>>) -> Tensor<3> {
+        let b = image_tokens.dims()[0];
         let mut parts = Vec::with_capacity(3);
         let registers = self.registers.val(); // [r, d]
         if registers.dims()[0] > 0 {
@@ -356,8 +405,45 @@ impl Dit {
         if image_tokens.dims()[1] > 0 {
             parts.push(self.img_in.forward(image_tokens));
         }
-        parts.push(gaussians);
+        parts.extend(others);
         Tensor::cat(parts, 1)
+    }
+
+    /// All blocks, and the output layer on the last `queries` tokens: `[b, queries, output channels]`.
+    fn blocks_and_output(&self, mut x: Tensor<3>, silu_c: Tensor<2>, queries: usize) -> Tensor<3> {
+        for (i, block) in self.blocks.iter().enumerate() {
+            // Only tokens that become Gaussians leave the last block, so only they need computing there.
+            let queries = if i + 1 == self.blocks.len() { queries } else { x.dims()[1] };
+            x = block.forward(x, silu_c.clone(), queries, self.compute, self.recompute);
+        }
+        let [b, _, d] = x.dims();
+        let modulation = match (&self.output.adaln, &self.output.norm) {
+            (Some(adaln), _) => Some(adaln.forward(silu_c)),
+            (None, Some(norm)) => Some(norm.val().reshape([1, 2 * d]).repeat_dim(0, b)),
+            (None, None) => None,
+        };
+        if let Some(modulation) = modulation {
+            let [shift, scale] = chunks(modulation);
+            x = ops::modulated_norm(x, shift, scale, Compute::F32);
+        }
+        self.output.linear.forward(x)
+    }
+
+    /// What a model that predicts in one pass says of each token that becomes Gaussians, before decoding.
+    ///
+    /// `image_tokens`: `[b, m, image_channels]`. Returns `[b, tokens, channels]`: one row per learned token, or per image
+    /// token of a pixel-aligned model.
+    ///
+    /// # Panics
+    /// If this is a model of flow matching.
+    pub fn predict(&self, image_tokens: Tensor<3>) -> Tensor<3> {
+        assert!(self.gs_in.is_none(), "a model of flow matching predicts from noise");
+        let [b, m, _] = image_tokens.dims();
+        let latents = self.latents.as_ref().map(|l| l.val().unsqueeze_dim::<3>(0).repeat_dim(0, b)); // [b, tokens, d]
+        let queries = latents.as_ref().map_or(m, |l| l.dims()[1]);
+        let no_time = Tensor::zeros([b, 1], &image_tokens.device());
+        let x = self.sequence(image_tokens, latents);
+        self.blocks_and_output(x, no_time, queries)
     }
 
     /// The tokens after the first block, for tests.
@@ -389,18 +475,9 @@ impl Dit {
         let gaussian_tokens = n / self.gaussians_per_token;
         let feedback = feedback.into();
         let known = self.preconditioning.map(|d| best_linear(noisy.clone(), feedback.estimate.clone(), d, t.clone()));
-        let mut x = self.tokens(noisy, feedback, image_tokens);
+        let x = self.tokens(noisy, feedback, image_tokens);
         let silu_c = silu(self.condition(t)); // [b, d]
-        for (i, block) in self.blocks.iter().enumerate() {
-            // Only Gaussian tokens leave the last block, so only they need computing there.
-            let queries = if i + 1 == self.blocks.len() { gaussian_tokens } else { x.dims()[1] };
-            x = block.forward(x, silu_c.clone(), queries, self.compute, self.recompute);
-        }
-        if let Some(adaln) = &self.output.adaln {
-            let [shift, scale] = chunks(adaln.forward(silu_c));
-            x = ops::modulated_norm(x, shift, scale, Compute::F32);
-        }
-        let out = self.output.linear.forward(x).reshape([b, n, CHANNELS]);
+        let out = self.blocks_and_output(x, silu_c, gaussian_tokens).reshape([b, n, CHANNELS]);
         match known {
             Some((mean, deviation)) => mean + out * deviation,
             None => out,

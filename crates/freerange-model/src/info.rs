@@ -121,12 +121,21 @@ pub fn tensors(config: &ModelConfig) -> Vec<TensorInfo> {
     }
     out.push(TensorInfo { name: "dit.registers".to_owned(), shape: vec![config.registers, d] });
     linear(&mut out, "dit.img_in", config.image_token_width(), d);
-    linear(&mut out, "dit.gs_in", config.gaussian_channels(), d);
-    linear(&mut out, "dit.t_mlp.0", config.time_features, d);
-    linear(&mut out, "dit.t_mlp.2", d, d);
+    let one_pass = config.kind.one_pass();
+    if !one_pass {
+        linear(&mut out, "dit.gs_in", config.gaussian_channels(), d);
+        linear(&mut out, "dit.t_mlp.0", config.time_features, d);
+        linear(&mut out, "dit.t_mlp.2", d, d);
+    }
+    if config.learned_tokens() > 0 {
+        out.push(TensorInfo { name: "dit.latents".to_owned(), shape: vec![config.learned_tokens(), d] });
+    }
     for i in 0..config.blocks {
         let name = |part: &str| format!("dit.blocks.{i}.{part}");
-        linear(&mut out, &name("adaln"), d, 6 * d);
+        match one_pass {
+            false => linear(&mut out, &name("adaln"), d, 6 * d),
+            true => out.push(TensorInfo { name: name("norms"), shape: vec![4, d] }),
+        }
         linear(&mut out, &name("attn.qkv"), d, 3 * d);
         for part in ["attn.q_norm.weight", "attn.k_norm.weight"] {
             out.push(TensorInfo { name: name(part), shape: vec![config.head_width()] });
@@ -135,10 +144,12 @@ pub fn tensors(config: &ModelConfig) -> Vec<TensorInfo> {
         linear(&mut out, &name("ffn.proj_in"), d, 2 * f);
         linear(&mut out, &name("ffn.proj_out"), f, d);
     }
-    if config.final_layer == FinalLayer::Adaln {
-        linear(&mut out, "dit.final.adaln", d, 2 * d);
+    match (config.final_layer, one_pass) {
+        (FinalLayer::Adaln, false) => linear(&mut out, "dit.final.adaln", d, 2 * d),
+        (FinalLayer::Adaln, true) => out.push(TensorInfo { name: "dit.final.norm".to_owned(), shape: vec![2, d] }),
+        (FinalLayer::Linear, _) => {}
     }
-    linear(&mut out, "dit.final.linear", d, config.gaussians_per_token * crate::CHANNELS);
+    linear(&mut out, "dit.final.linear", d, config.output_channels());
     out
 }
 
@@ -164,7 +175,6 @@ impl ModelInfo {
         let tensors = tensors(config);
         let sum = |prefix: &str| tensors.iter().filter(|t| t.name.starts_with(prefix)).map(TensorInfo::count).sum();
         let (d, f) = (config.hidden, config.ffn_width());
-        let p = config.gaussians_per_token;
         let mut parts = Vec::new();
         let mut part = |name: &str, shape: String, parameters: u64| {
             parts.push(PartInfo { name: name.to_owned(), shape, parameters });
@@ -187,17 +197,26 @@ impl ModelInfo {
         }
         part("registers", format!("{} x {d}", config.registers), sum("dit.registers"));
         part("image input", format!("{} to {d}", config.image_token_width()), sum("dit.img_in"));
-        part("Gaussian input", format!("{p} Gaussians, {} to {d}", config.gaussian_channels()), sum("dit.gs_in"));
-        part("time", format!("{} to {d} to {d}", config.time_features), sum("dit.t_mlp"));
-        let blocks = config.blocks;
-        part("blocks: modulation", format!("{blocks} x ({d} to 6 x {d})"), count(&tensors, ".adaln.", "dit.blocks"));
+        let (p, blocks) = (config.gaussians_per_token, config.blocks);
+        if config.kind.one_pass() {
+            part("learned tokens", format!("{} x {d}", config.learned_tokens()), sum("dit.latents"));
+            part("blocks: norms", format!("{blocks} x (4 x {d})"), count(&tensors, ".norms", "dit.blocks"));
+        } else {
+            part("Gaussian input", format!("{p} Gaussians, {} to {d}", config.gaussian_channels()), sum("dit.gs_in"));
+            part("time", format!("{} to {d} to {d}", config.time_features), sum("dit.t_mlp"));
+            part(
+                "blocks: modulation",
+                format!("{blocks} x ({d} to 6 x {d})"),
+                count(&tensors, ".adaln.", "dit.blocks"),
+            );
+        }
         part(
             "blocks: attention",
             format!("{blocks} x ({} heads of {})", config.heads, config.head_width()),
             count(&tensors, ".attn.", "dit.blocks"),
         );
         part("blocks: GEGLU", format!("{blocks} x ({d} to 2 x {f} to {d})"), count(&tensors, ".ffn.", "dit.blocks"));
-        part("output", format!("{d} to {}", p * crate::CHANNELS), sum("dit.final"));
+        part("output", format!("{d} to {}", config.output_channels()), sum("dit.final"));
 
         let trainable: u64 = tensors.iter().map(TensorInfo::count).sum();
         let tokens = config.tokens(workload.views, workload.gaussians);
@@ -237,7 +256,7 @@ impl Memory {
         let [d, f, h] = [config.hidden, config.ffn_width(), config.heads].map(|n| n as u64);
         let tokens = config.tokens(workload.views, workload.gaussians);
         let r = (workload.batch * tokens) as u64;
-        let last = (workload.batch * (workload.gaussians / config.gaussians_per_token)) as u64;
+        let last = (workload.batch * config.output_tokens(workload.views, workload.gaussians)) as u64;
         let half = execution.gpu && execution.compute != Compute::F32;
         let number = if half { F32 / 2 } else { F32 };
         let block = |q: u64| F32 * (r * d + q * d + q * h) + number * (r * 4 * d + q * (4 * d + 3 * f));
@@ -274,20 +293,23 @@ fn count(tensors: &[TensorInfo], part: &str, prefix: &str) -> u64 {
 fn forward_flops(config: &ModelConfig, workload: Workload) -> f64 {
     let [d, f] = [config.hidden, config.ffn_width()].map(|x| x as f64);
     let tokens = config.tokens(workload.views, workload.gaussians) as f64;
-    let gaussians = (workload.gaussians / config.gaussians_per_token) as f64;
-    let images = (workload.views * config.patches_per_side().pow(2)) as f64;
-    let inputs = images * config.image_token_width() as f64 + gaussians * config.gaussian_channels() as f64;
-    let output = gaussians * (config.gaussians_per_token * crate::CHANNELS) as f64;
-    let time = config.time_features as f64 * d + d * d;
+    let outputs = config.output_tokens(workload.views, workload.gaussians) as f64;
+    let images = config.image_tokens(workload.views) as f64;
+    let (noisy, time) = match config.kind.one_pass() {
+        true => (0.0, 0.0),
+        false => (outputs * config.gaussian_channels() as f64, config.time_features as f64 * d + d * d),
+    };
+    let inputs = images * config.image_token_width() as f64 + noisy;
+    let output = outputs * config.output_channels() as f64;
     let block = |queries: f64| {
-        let modulation = 6.0 * d * d;
+        let modulation = if config.kind.one_pass() { 0.0 } else { 6.0 * d * d };
         let qkv = tokens * 3.0 * d * d;
         let attention = 2.0 * queries * tokens * d + queries * d * d;
         modulation + qkv + attention + queries * 3.0 * d * f
     };
     let blocks = match config.blocks {
         0 => 0.0,
-        n => (n - 1) as f64 * block(tokens) + block(gaussians),
+        n => (n - 1) as f64 * block(tokens) + block(outputs),
     };
     2.0 * (inputs * d + time + blocks + output * d)
 }
@@ -353,7 +375,7 @@ mod tests {
     use rand::SeedableRng;
 
     use super::*;
-    use crate::{FreeRange, PatchConfig};
+    use crate::{FreeRange, ModelKind, PatchConfig, VolumeConfig};
 
     fn model(config: &ModelConfig) -> FreeRange {
         FreeRange::new(config, &mut rand_chacha::ChaCha8Rng::seed_from_u64(1), &Device::flex()).unwrap()
@@ -387,6 +409,36 @@ mod tests {
             let info = ModelInfo::new(&config, LOAD);
             assert_eq!(info.trainable, model(&config).num_params() as u64);
             assert_eq!(info.parts.iter().map(|p| p.parameters).sum::<u64>(), info.trainable);
+        }
+    }
+
+    #[test]
+    fn models_of_one_pass_are_counted_as_built() {
+        let small = ModelConfig {
+            image_size: 8,
+            encoder: EncoderConfig::Patch(PatchConfig { patch_size: 4, channels: 4, patch_hidden: 0 }),
+            hidden: 24,
+            blocks: 2,
+            heads: 4,
+            ffn: Some(40),
+            registers: 3,
+            gradient_channels: false,
+            ..ModelConfig::default()
+        };
+        let volume = VolumeConfig { tokens_per_side: 2, cells_per_token_side: 2, gaussians_per_cell: 3 };
+        for (config, tokens, gaussians) in [
+            (ModelConfig { kind: ModelKind::LatentTokens, latent_tokens: 6, ..small.clone() }, 3 + 12 + 6, 12),
+            (ModelConfig { kind: ModelKind::PixelAligned, ..small.clone() }, 3 + 12, 3 * 64),
+            (ModelConfig { kind: ModelKind::VoxelAligned, volume: Some(volume), ..small.clone() }, 3 + 12 + 8, 192),
+        ] {
+            let real: Vec<TensorInfo> =
+                model(&config).parameters().into_iter().map(|p| TensorInfo { name: p.name, shape: p.shape }).collect();
+            assert_eq!(tensors(&config), real);
+            assert_eq!(config.gaussians(9, 3), gaussians);
+            let info = ModelInfo::new(&config, Workload { batch: 2, views: 3, gaussians });
+            assert_eq!((info.tokens, info.trainable), (tokens, model(&config).num_params() as u64));
+            assert_eq!(info.parts.iter().map(|p| p.parameters).sum::<u64>(), info.trainable);
+            assert!(info.step_bytes > info.state_bytes && info.forward_flops > 0.0);
         }
     }
 

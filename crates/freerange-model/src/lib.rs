@@ -14,6 +14,7 @@ mod kernels;
 mod layers;
 mod memory;
 mod model;
+mod one_pass;
 mod ops;
 #[cfg(test)]
 mod tests;
@@ -21,7 +22,8 @@ mod weights;
 
 pub use checkpoint::{Checkpoint, Header, Precision};
 pub use config::{
-    CHANNELS, Dinov2Config, EncoderConfig, FinalLayer, ModelConfig, OBSERVATION, PLACE, PLUCKER, PatchConfig,
+    CHANNELS, Dinov2Config, EncoderConfig, FinalLayer, ModelConfig, ModelKind, OBSERVATION, PLACE, PLUCKER,
+    PatchConfig, VolumeConfig,
 };
 pub use dit::{Dit, Feedback, time_embedding};
 pub use encoder::{Dinov2, ImageEncoder, WeightsOrigin, position_embedding};

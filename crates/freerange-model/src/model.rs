@@ -7,8 +7,9 @@ use burn::{
 use rand::Rng;
 
 use crate::{
-    Dinov2, Dit, EncoderConfig, Feedback, ImageEncoder, ModelConfig, ModelError,
+    Dinov2, Dit, EncoderConfig, Feedback, ImageEncoder, ModelConfig, ModelError, ModelKind,
     layers::{Builder, RandomSource, Source},
+    one_pass::Decoder,
     ops::Compute,
 };
 
@@ -17,6 +18,10 @@ use crate::{
 pub struct FreeRange {
     encoder: ImageEncoder,
     dit: Dit,
+    #[module(skip)]
+    kind: ModelKind,
+    #[module(skip)]
+    decoder: Decoder,
 }
 
 /// One trainable tensor of a model: its PyTorch-like name, its shape, its values.
@@ -55,6 +60,8 @@ impl FreeRange {
         Ok(Self {
             encoder: ImageEncoder::build(config, dinov2, "encoder.", builder)?,
             dit: Dit::build(config, config.image_token_width(), "dit.", builder)?,
+            kind: config.kind,
+            decoder: Decoder::new(config),
         })
     }
 
@@ -128,6 +135,23 @@ impl FreeRange {
         t: Tensor<1>,
     ) -> Tensor<3> {
         self.dit.forward(noisy, feedback, image_tokens, t)
+    }
+
+    /// What its tokens stand for.
+    pub fn kind(&self) -> ModelKind {
+        self.kind
+    }
+
+    /// The Gaussians of a model that predicts in one pass: `[b, n, 14]`, normalized for
+    /// [latent tokens](ModelKind::LatentTokens), else as they are in the canonical frame.
+    ///
+    /// `image_tokens` as [`encode`](Self::encode) gives them; `rays` one Plücker ray per pixel,
+    /// `[b, views, h, w, 6]`, for a [pixel-aligned](ModelKind::PixelAligned) model and no other.
+    ///
+    /// # Panics
+    /// If this is a model of flow matching, or rays are missing or not wanted.
+    pub fn predict(&self, image_tokens: Tensor<3>, rays: Option<Tensor<5>>) -> Tensor<3> {
+        self.decoder.decode(self.dit.predict(image_tokens), rays)
     }
 
     /// Every trainable tensor, in a fixed order.

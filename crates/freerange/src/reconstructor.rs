@@ -101,12 +101,13 @@ impl Reconstructor {
         told.and_then(serde_json::Value::as_u64).and_then(|n| n.try_into().ok()).filter(|n| *n > 0).unwrap_or(4)
     }
 
-    /// Gaussians that it makes by default, before refinement.
+    /// Gaussians that it makes by default, before refinement; of a pixel-aligned model for as many views as it is shown.
     ///
     /// # Errors
     /// If what the checkpoint says of sampling cannot be used.
     pub fn gaussians(&self) -> Result<usize, Error> {
-        Ok(1 << sampling(&self.checkpoint.provenance)?.depth_of(self.checkpoint.depth))
+        let depth = sampling(&self.checkpoint.provenance)?.depth_of(self.checkpoint.depth);
+        Ok(self.checkpoint.config.gaussians(depth, self.views()))
     }
 
     /// Refuses options that this model or its device cannot follow.
@@ -115,6 +116,12 @@ impl Reconstructor {
     /// Names the option.
     pub fn check(&self, options: &Options) -> Result<(), Error> {
         options.sample.validate()?;
+        let kind = self.checkpoint.config.kind;
+        options.sample.validate_for(kind)?;
+        if kind.one_pass() && options.seeds.len() > 1 {
+            let expected = format!("one sample: a {} model has one answer", kind.name());
+            return Err(Error::input("seeds", expected, options.seeds.len()));
+        }
         if options.without_network && options.sample.start.is_none() {
             return Err(Error::input("sample.start", "a quick fit to start from", "none"));
         }

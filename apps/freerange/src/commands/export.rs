@@ -35,11 +35,15 @@ fn parse_license(text: &str) -> Result<String, String> {
 /// What is known of the shipped checkpoint; links in it lead to files beside it.
 const SHIPPED_CARD: &str = include_str!("../../../../docs/model-card.md");
 
+/// Input views that the number of Gaussians is given for: it depends on them in pixel-aligned models alone.
+const VIEWS: usize = 4;
+
 pub fn run(args: &Args) -> Result<(), CliError> {
     let path = runtime::local_or_shipped(args.checkpoint.as_deref())?;
     let bytes = checkpoint_bytes(path.as_deref())?;
     let checkpoint = checkpoint_header(path.as_deref())?;
-    let gaussians = 1u64 << sampling(&checkpoint.provenance)?.depth_of(checkpoint.depth);
+    let depth = sampling(&checkpoint.provenance)?.depth_of(checkpoint.depth);
+    let gaussians = checkpoint.config.gaussians(depth, VIEWS) as u64;
     let config = serde_json::json!({
         "model_type": "free-range",
         "library_name": "freerange",

@@ -133,7 +133,11 @@ fn info(args: &Info) -> Result<(), CliError> {
             (c.config, depth, 1, Compute::F32, false, Some((c.provenance, c.encoder_weights)))
         }
     };
-    let workload = Workload { batch: args.batch.unwrap_or(batch), views: args.views, gaussians: 1 << depth };
+    let workload = Workload {
+        batch: args.batch.unwrap_or(batch),
+        views: args.views,
+        gaussians: model.gaussians(depth, args.views),
+    };
     let execution = Execution { gpu: args.gpu, compute, recompute };
     let info = ModelInfo::with_execution(&model, workload, execution);
     if args.json {

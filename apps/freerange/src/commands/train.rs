@@ -275,7 +275,7 @@ fn dry_run(config: &TrainConfig, device: &Device) -> Result<(), CliError> {
         let workload = Workload {
             batch: stage.at_a_time().min(stage.batch / config.data.lanes),
             views,
-            gaussians: 1 << stage.depth,
+            gaussians: model.gaussians(stage.depth, views),
         };
         let o = &config.optimizer;
         let execution = Execution { gpu: *device != Device::flex(), compute: o.compute, recompute: o.recompute };

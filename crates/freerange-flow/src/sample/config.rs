@@ -2,7 +2,7 @@
 
 use freerange_core::Invalid;
 use freerange_fit::QuickFitConfig;
-use freerange_model::Compute;
+use freerange_model::{Compute, ModelKind};
 
 use super::{Background, sampler::PhotometricStep, solver::Solver};
 use crate::{FlowError, coupling::Coupling};
@@ -193,6 +193,34 @@ impl SampleConfig {
     /// Depth of the level-of-detail tree whose slice is made, by a model that was trained at depth `trained`: `2^depth` Gaussians.
     pub fn depth_of(&self, trained: u32) -> u32 {
         self.depth.unwrap_or(trained)
+    }
+
+    /// Refuses settings that mean nothing to a model of this kind: one that predicts in one pass has no noise to begin
+    /// with, no steps and no guidance.
+    ///
+    /// # Errors
+    /// Names the setting.
+    pub fn validate_for(&self, kind: ModelKind) -> Result<(), FlowError> {
+        if !kind.one_pass() {
+            return Ok(());
+        }
+        let check = |ok: bool, field: &str, expected: &str, found: String| match ok {
+            true => Ok(()),
+            false => {
+                let expected = format!("{expected} for a {} model, which predicts in one pass", kind.name());
+                Err(FlowError::from(Invalid::new(format!("sample.{field}"), expected, found)))
+            }
+        };
+        check(self.steps == 1, "steps", "1", self.steps.to_string())?;
+        check(self.solver == Solver::Euler, "solver", "none (euler)", format!("{:?}", self.solver).to_lowercase())?;
+        check(self.cfg_scale == 1.0, "cfg_scale", "1", self.cfg_scale.to_string())?;
+        check(self.lambda_pg == 0.0, "lambda_pg", "0", self.lambda_pg.to_string())?;
+        check(self.start.is_none(), "start", "none", "one".into())?;
+        check(self.depth.is_none(), "depth", "none", format!("{:?}", self.depth))?;
+        check(self.polish == 0, "polish", "0", self.polish.to_string())?;
+        check(self.mend == 0, "mend", "0", self.mend.to_string())?;
+        check(self.regroup == 0, "regroup", "0", self.regroup.to_string())?;
+        check(self.ensemble == 1, "ensemble", "1", self.ensemble.to_string())
     }
 
     /// Refuses impossible values.

@@ -5,6 +5,7 @@
 pub(crate) mod bicubic;
 pub(crate) mod dinov2;
 mod patch;
+pub(crate) use patch::patches;
 
 use burn::{
     module::Module,

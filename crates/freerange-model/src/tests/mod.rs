@@ -5,6 +5,7 @@ mod checkpoint;
 mod dinov2;
 mod dit;
 mod encoder;
+mod one_pass;
 mod ops;
 
 use burn::tensor::{Device, Tensor, TensorData};
