@@ -102,9 +102,34 @@ fn sums_between_cards_are_refused_where_they_cannot_be_made() {
 
 #[test]
 fn killed_at_ten_points_it_learns_what_it_would_have() {
+    killed_at_ten_points(CONFIG);
+}
+
+#[test]
+fn killed_at_ten_points_models_of_one_pass_learn_what_they_would_have() {
+    for (kind, depth) in [
+        ("kind = \"latent_tokens\", latent_tokens = 4, gaussians_per_token = 4", 4),
+        ("kind = \"pixel_aligned\"", 3),
+        (
+            "kind = \"voxel_aligned\", volume = { tokens_per_side = 2, cells_per_token_side = 1, gaussians_per_cell = 2 }",
+            3,
+        ),
+    ] {
+        let model = format!("model = {{ {kind}, gradient_channels = false, image_size");
+        let config = CONFIG
+            .replace("model = { image_size", &model)
+            .replace("gaussians_per_token = 4, time_features = 8, ", "")
+            .replace("loss = { ", "loss = { flow = false, unconditional = 0.0, ")
+            .replace("gradient_size = 16\n", "lambda_pg = 0.0\n")
+            .replace("{ depth = 3,", &format!("{{ depth = {depth},"));
+        killed_at_ten_points(&config);
+    }
+}
+
+fn killed_at_ten_points(config: &str) {
     let place = tempfile::tempdir().unwrap();
     let path = |name: &str| -> PathBuf { place.path().join(name) };
-    fs::write(path("config.toml"), CONFIG).unwrap();
+    fs::write(path("config.toml"), config).unwrap();
     assert!(train(&path("config.toml"), &path("whole"), SAVE_EVERY).wait().unwrap().success());
     assert_eq!(saved(&path("whole")), STEPS);
 
