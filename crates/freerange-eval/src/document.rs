@@ -61,6 +61,11 @@ fn summary(report: &Report) -> Table {
     if fid {
         table.head.push("FID (images)".into());
     }
+    let frechet = report.groups.iter().any(|g| g.frechet_vgg.is_some());
+    if frechet {
+        let unseen = "Frechet (VGG16), unseen views (images)";
+        table.head.extend(["Frechet (VGG16)", "of means", unseen, "unseen, of means"].map(String::from));
+    }
     if disagreement {
         table.head.push("disagreement x100".into());
     }
@@ -79,6 +84,16 @@ fn summary(report: &Report) -> Table {
         }));
         if fid {
             row.push(Cell::text(g.fid.map_or("not computed".into(), |v| format!("{v:.2} ({})", g.images))));
+        }
+        if frechet {
+            let f = g.frechet_vgg;
+            let text = |value: Option<f64>| Cell::text(value.map_or("not computed".into(), |v| format!("{v:.2}")));
+            row.push(text(f.map(|f| f.sample)));
+            row.push(text(f.and_then(|f| f.mean)));
+            let images = f.map_or(0, |f| f.unseen_images);
+            let unseen = f.and_then(|f| f.unseen_sample);
+            row.push(Cell::text(unseen.map_or("not computed".into(), |v| format!("{v:.2} ({images})"))));
+            row.push(text(f.and_then(|f| f.unseen_mean)));
         }
         if disagreement {
             row.push(Cell::text(g.disagreement.map_or(String::new(), |v| format!("{:.3}", 100.0 * v))));

@@ -1,7 +1,7 @@
 //! A folder of results that a killed run leaves whole and a later one goes on with.
 //!
-//! `settings.json`, one `objects/CASE.json` per case (with `CASE.jpg`, the picture strip, and `CASE.f32`, the features for
-//! FID), and the reports.
+//! `settings.json`, one `objects/CASE.json` per case (with `CASE.jpg`, the picture strip, `CASE.f32` and `CASE.vgg.f32`, the
+//! features for FID and for the Frechet distance on VGG16), and the reports.
 
 use std::{
     fs,
@@ -29,6 +29,18 @@ pub(crate) const LARGEST: u64 = 1 << 30;
 pub struct RunFolder {
     path: PathBuf,
 }
+
+/// What networks see in the renders and true images of a case, for distances between sets of images.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Features {
+    /// Inception's, for FID: of all renders of the first sample, then of all true images.
+    pub inception: Vec<f32>,
+    /// VGG16's: of all renders of the first sample, of all true images, and of several samples' mean renders.
+    pub vgg: Vec<f32>,
+}
+
+/// Ending of the files of VGG16's features.
+const VGG: &str = "vgg.f32";
 
 impl RunFolder {
     /// Opens or makes the folder for a run with `settings`. `restart` throws the results of an earlier run away.
@@ -65,6 +77,11 @@ impl RunFolder {
         let objects = path.join(OBJECTS);
         fs::create_dir_all(&objects).map_err(IoError::at(&objects))?;
         Ok(folder)
+    }
+
+    /// The folder of a run that is over, to read from.
+    pub fn existing(path: &Path) -> Self {
+        Self { path: path.into() }
     }
 
     /// Removes what runs write, and nothing else.
@@ -121,14 +138,16 @@ impl RunFolder {
         Ok(self.record(case)?.is_some_and(|r| matches!(r.outcome, Outcome::Measured(_))))
     }
 
-    /// Writes what came of a case: `features` for FID and the `picture` first, so that a record stands for all of them.
+    /// Writes what came of a case: `features` and the `picture` first, so that a record stands for all of them.
     ///
     /// # Errors
     /// [`EvalError::Io`].
-    pub fn write(&self, record: &Record, features: &[f32], picture: Option<&[u8]>) -> Result<(), EvalError> {
+    pub fn write(&self, record: &Record, features: &Features, picture: Option<&[u8]>) -> Result<(), EvalError> {
         let mut files: Vec<(&str, Vec<u8>)> = Vec::new();
-        if !features.is_empty() {
-            files.push(("f32", features.iter().flat_map(|v| v.to_le_bytes()).collect()));
+        for (ending, values) in [("f32", &features.inception), (VGG, &features.vgg)] {
+            if !values.is_empty() {
+                files.push((ending, values.iter().flat_map(|v| v.to_le_bytes()).collect()));
+            }
         }
         if let Some(picture) = picture {
             files.push(("jpg", picture.to_vec()));
@@ -140,12 +159,24 @@ impl RunFolder {
         Ok(())
     }
 
-    /// The `count` features that were written with a case.
+    /// The `count` features for FID that were written with a case.
     ///
     /// # Errors
     /// [`EvalError::Io`]; [`EvalError::File`] where there is another number of them.
     pub fn features(&self, case: &Case, count: usize) -> Result<Vec<f32>, EvalError> {
-        let file = self.file(case, "f32");
+        self.numbers(case, "f32", count)
+    }
+
+    /// The `count` features of VGG16 that were written with a case.
+    ///
+    /// # Errors
+    /// As [`features`](Self::features).
+    pub fn vgg_features(&self, case: &Case, count: usize) -> Result<Vec<f32>, EvalError> {
+        self.numbers(case, VGG, count)
+    }
+
+    fn numbers(&self, case: &Case, ending: &str, count: usize) -> Result<Vec<f32>, EvalError> {
+        let file = self.file(case, ending);
         let bytes = fs::read(&file).map_err(IoError::at(&file))?;
         if bytes.len() != count.saturating_mul(4) {
             return Err(EvalError::file(&file, format!("{count} features"), format!("{} bytes", bytes.len())));
@@ -243,7 +274,8 @@ mod tests {
         let path = place.path().join("out");
         let settings = json!({ "method": "model", "sample": { "steps": 50, "guidance": 1.5 } });
         let folder = RunFolder::open(&path, &settings, false).unwrap();
-        folder.write(&failed("a"), &[1.5, -2.0], Some(b"jpeg")).unwrap();
+        let features = Features { inception: vec![1.5, -2.0], vgg: vec![0.5] };
+        folder.write(&failed("a"), &features, Some(b"jpeg")).unwrap();
         fs::write(path.join("mine.txt"), "mine").unwrap();
 
         let again = RunFolder::open(&path, &settings, false).unwrap();
@@ -252,6 +284,7 @@ mod tests {
         assert!(!again.is_done(&failed("a").case).unwrap());
         assert_eq!(again.features(&failed("a").case, 2).unwrap(), [1.5, -2.0]);
         assert!(again.features(&failed("a").case, 3).is_err());
+        assert_eq!(again.vgg_features(&failed("a").case, 1).unwrap(), [0.5]);
         assert_eq!(again.picture(&failed("a").case).unwrap().unwrap(), b"jpeg");
 
         let other = json!({ "method": "model", "sample": { "steps": 20, "guidance": 1.5 }, "refine": 5 });
@@ -291,7 +324,7 @@ mod tests {
         }
         let path = place.path().join("out");
         let folder = RunFolder::open(&path, &json!({}), false).unwrap();
-        folder.write(&failed("a"), &[], None).unwrap();
+        folder.write(&failed("a"), &Features::default(), None).unwrap();
         let file = folder.file(&failed("a").case, "json");
         let text = fs::read_to_string(&file).unwrap();
         fs::write(&file, text.replace("\"a\"", "\"b\"")).unwrap();

@@ -109,6 +109,9 @@ pub struct Measured {
     /// Number of Inception features that are kept of renders, and as many of images, for FID; 0 without FID.
     #[serde(default)]
     pub features: usize,
+    /// Number of VGG16's features that are kept, and of what; none without the Frechet distance of these.
+    #[serde(default)]
+    pub vgg: Option<VggFeatures>,
     /// Whether a picture strip was written.
     #[serde(default)]
     pub picture: bool,
@@ -117,6 +120,18 @@ pub struct Measured {
     pub notes: Vec<String>,
     /// The commit that the program was built from.
     pub commit: String,
+}
+
+/// VGG16's features that are kept of a case: of the first sample's renders, of true images, of mean renders.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct VggFeatures {
+    /// Numbers in all.
+    pub count: usize,
+    /// Of each validation view, whether it looks from where no input does: along an axis more than 60 degrees from theirs.
+    pub unseen: Vec<bool>,
+    /// Samples that the mean renders are means of; 1: there are none.
+    pub samples: usize,
 }
 
 impl Measured {
@@ -238,6 +253,7 @@ mod tests {
             validation_sha256: "00".into(),
             samples: Vec::new(),
             features: 0,
+            vgg: Some(VggFeatures { count: 3, unseen: vec![true], samples: 2 }),
             picture: false,
             notes: Vec::new(),
             commit: "c".into(),

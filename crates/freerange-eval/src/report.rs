@@ -8,8 +8,8 @@ use serde_json::Value;
 use crate::{
     EvalError,
     folder::{RunFolder, read_json},
-    record::{Case, Measured, Outcome, Record, ViewSet, ordered},
-    scorer::{UsedFile, fid},
+    record::{Case, Measured, Outcome, Record, VggFeatures, ViewSet, ordered},
+    scorer::{UsedFile, fid, frechet_vgg},
     statistics::{Interval, bootstrap, mean, quantile},
 };
 
@@ -72,6 +72,9 @@ pub struct Group {
     pub metrics: BTreeMap<String, Spread>,
     /// FID over all validation images of the group.
     pub fid: Option<f64>,
+    /// The Frechet distances of VGG16's features.
+    #[serde(default)]
+    pub frechet_vgg: Option<FrechetVgg>,
     /// Validation images of the group.
     pub images: usize,
     /// Mean number of Gaussians.
@@ -82,6 +85,65 @@ pub struct Group {
     pub peak_memory_bytes: Option<u64>,
     /// Mean disagreement between samples.
     pub disagreement: Option<f64>,
+}
+
+/// Frechet distances between VGG16's features of renders and of true images. Not FID: see
+/// [`Metric::FrechetVgg`](freerange_metrics::Metric).
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct FrechetVgg {
+    /// Of one sample of each object, over all validation images.
+    pub sample: f64,
+    /// Of the mean renders of several samples.
+    pub mean: Option<f64>,
+    /// Validation images from where no input looks.
+    pub unseen_images: usize,
+    /// Of one sample, over those.
+    pub unseen_sample: Option<f64>,
+    /// Of the mean renders, over those.
+    pub unseen_mean: Option<f64>,
+}
+
+impl FrechetVgg {
+    /// Of cases with what is kept of each; none if nothing is.
+    fn new<'a>(
+        kept: impl Iterator<Item = (&'a Case, &'a VggFeatures)>,
+        folder: &RunFolder,
+    ) -> Result<Option<Self>, EvalError> {
+        let mut views = Vec::new(); // features of the render, the true image and the mean render; whether unseen
+        for (case, VggFeatures { count, unseen, samples }) in kept {
+            let all = folder.vgg_features(case, *count)?;
+            let parts = if *samples > 1 { 3 } else { 2 };
+            if unseen.is_empty() || !count.is_multiple_of(parts * unseen.len()) {
+                let expected = format!("features of {} views, {parts} each", unseen.len());
+                return Err(EvalError::Object { object: case.object.clone(), expected, found: count.to_string() });
+            }
+            let width = count / (parts * unseen.len());
+            let of = |part: usize, view: usize| all[(part * unseen.len() + view) * width..][..width].to_vec();
+            let mean = |view| (parts == 3).then(|| of(2, view));
+            views.extend(unseen.iter().enumerate().map(|(i, &unseen)| (of(0, i), of(1, i), mean(i), unseen)));
+        }
+        let distance = |unseen_alone: bool, of_means: bool| {
+            let chosen = views.iter().filter(|v| v.3 || !unseen_alone);
+            let pairs: Option<Vec<(&[f32], &[f32])>> = chosen
+                .map(|(render, truth, mean, _)| match of_means {
+                    true => Some((mean.as_deref()?, truth.as_slice())),
+                    false => Some((render.as_slice(), truth.as_slice())),
+                })
+                .collect();
+            let Some((renders, truths)) = pairs.map(|p| p.into_iter().unzip::<_, _, Vec<_>, Vec<_>>()) else {
+                return Ok(None);
+            };
+            frechet_vgg(&renders, &truths)
+        };
+        let Some(sample) = distance(false, false)? else { return Ok(None) };
+        Ok(Some(Self {
+            sample,
+            mean: distance(false, true)?,
+            unseen_images: views.iter().filter(|v| v.3).count(),
+            unseen_sample: distance(true, false)?,
+            unseen_mean: distance(true, true)?,
+        }))
+    }
 }
 
 /// The values of a metric over objects.
@@ -121,7 +183,9 @@ impl Report {
             let own = || records.iter().filter(|r| (r.case.views, r.case.inputs) == (views, inputs));
             let kept = own().filter_map(measured).filter(|(_, m)| m.features > 0);
             let fid = fid(kept.map(|(case, m)| folder.features(case, m.features)))?;
-            groups.push(Group::new(views, inputs, own(), fid));
+            let kept = own().filter_map(measured).filter_map(|(case, m)| Some((case, m.vgg.as_ref()?)));
+            let frechet_vgg = FrechetVgg::new(kept, folder)?;
+            groups.push(Group { fid, frechet_vgg, ..Group::new(views, inputs, own()) });
         }
         let mut commits: Vec<String> = records.iter().filter_map(measured).map(|(_, m)| m.commit.clone()).collect();
         commits.sort();
@@ -188,12 +252,7 @@ fn measured(record: &Record) -> Option<(&Case, &Measured)> {
 }
 
 impl Group {
-    fn new<'a>(
-        views: ViewSet,
-        inputs: usize,
-        records: impl Iterator<Item = &'a Record> + Clone,
-        fid: Option<f64>,
-    ) -> Self {
+    fn new<'a>(views: ViewSet, inputs: usize, records: impl Iterator<Item = &'a Record> + Clone) -> Self {
         let numbers: Vec<&Measured> = records.clone().filter_map(measured).map(|(_, m)| m).collect();
         let names = ordered(numbers.iter().flat_map(|m| m.metrics.keys()));
         let spread = |name: String| {
@@ -214,7 +273,8 @@ impl Group {
             failed: records.clone().filter(|r| matches!(r.outcome, Outcome::Failed { .. })).count(),
             skipped: records.clone().filter(|r| matches!(r.outcome, Outcome::Skipped { .. })).count(),
             metrics: names.into_iter().filter_map(spread).collect(),
-            fid,
+            fid: None,
+            frechet_vgg: None,
             images: numbers.iter().map(|m| m.samples.first().map_or(0, |s| s.views.len())).sum(),
             gaussians: average(&Measured::gaussians),
             seconds: average(&|m| m.seconds),
@@ -227,6 +287,7 @@ impl Group {
     pub fn value(&self, metric: &str) -> Option<f64> {
         match metric {
             "fid" => self.fid,
+            "frechet-vgg" => self.frechet_vgg.map(|f| f.sample),
             _ => self.metrics.get(metric).map(|s| s.interval.mean),
         }
     }

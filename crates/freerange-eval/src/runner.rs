@@ -6,13 +6,14 @@ use freerange_camera::{View, image_ops::composite};
 use freerange_core::Share;
 use freerange_raster::{RasterConfig, render};
 use freerange_splat::Cloud;
+use glam::DMat4;
 use serde_json::Value;
 
 use crate::{
-    Environment, EvalError, EvalObject, Pair, Report, RunFolder, Scorer, document,
+    Environment, EvalError, EvalObject, Features, Pair, Report, RunFolder, Scorer, document,
     html::{Embed, html},
     memory::{peak_memory, reset_peak_memory},
-    record::{Case, Measured, Outcome, Record, SampleScores, ViewScores, ViewSet, means, style},
+    record::{Case, Measured, Outcome, Record, SampleScores, VggFeatures, ViewScores, ViewSet, means, style},
     statistics::deviation,
     strip,
 };
@@ -153,7 +154,7 @@ pub fn work(runs: &[Run], shared: &Shared, tell: &mut dyn FnMut(Event<'_>)) -> R
             let record = Record { case, outcome };
             // What has numbers was written with its picture.
             if !matches!(record.outcome, Outcome::Measured(_)) {
-                run.folder.write(&record, &[], None)?;
+                run.folder.write(&record, &Features::default(), None)?;
             }
             tell(Event::Record { run, record: &record });
             tell(Event::Cases { done, total, object: name });
@@ -190,8 +191,8 @@ fn measure_case(run: &Run, case: &Case, object: &EvalObject, shared: &Shared) ->
     Ok(record.outcome)
 }
 
-/// Numbers (but for time and memory), features for FID, and the picture strip.
-type Scored = (Measured, Vec<f32>, Option<Vec<u8>>);
+/// Numbers (but for time and memory), features, and the picture strip.
+type Scored = (Measured, Features, Option<Vec<u8>>);
 
 fn score(found: &Reconstructed, object: &EvalObject, inputs: &[View], shared: &Shared) -> Result<Scored, EvalError> {
     let validation = object.validation();
@@ -213,6 +214,12 @@ fn score(found: &Reconstructed, object: &EvalObject, inputs: &[View], shared: &S
         }
         renders.push(images);
     }
+    let vgg = vgg_features(&renders, &truths, &sizes, &shared.scorer)?;
+    let vgg_kept = (!vgg.is_empty()).then(|| VggFeatures {
+        count: vgg.len(),
+        unseen: validation.iter().map(|v| is_unseen(v, inputs)).collect(),
+        samples: renders.len(),
+    });
     let picture = match (&shared.pictures, renders.first()) {
         (Pictures::None, _) | (_, None) => None,
         (_, Some(first)) => Some(strip(inputs, &validation, first)?),
@@ -227,11 +234,48 @@ fn score(found: &Reconstructed, object: &EvalObject, inputs: &[View], shared: &S
         validation_sha256: object.validation_sha256(),
         samples,
         features: features.len(),
+        vgg: vgg_kept,
         picture: picture.is_some(),
         notes: found.notes.clone(),
         commit: shared.commit.clone(),
     };
-    Ok((measured, features, picture))
+    Ok((measured, Features { inception: features, vgg }, picture))
+}
+
+/// Angle between viewing axes, in degrees, beyond which a view counts as one that no input saw.
+const UNSEEN: f64 = 60.0;
+
+fn is_unseen(view: &View, inputs: &[View]) -> bool {
+    let axis = |v: &View| DMat4::row(&v.camera.world_to_camera, 2).truncate().normalize(); // z forward
+    inputs.iter().all(|input| axis(input).dot(axis(view)) < UNSEEN.to_radians().cos())
+}
+
+/// VGG16's features: of each view of the first sample, of the true images, and of several samples of their mean renders.
+/// Empty if they are not asked for.
+fn vgg_features(
+    renders: &[Vec<Vec<f32>>], // [samples][views]
+    truths: &[Vec<f32>],
+    sizes: &[[u32; 2]],
+    scorer: &Scorer,
+) -> Result<Vec<f32>, EvalError> {
+    let of = |images: &[Vec<f32>]| {
+        let images = images.iter().zip(sizes);
+        scorer.vgg_features(&images.map(|(i, s)| (i.as_slice(), s.map(|x| x as usize))).collect::<Vec<_>>())
+    };
+    let Some(first) = renders.first() else { return Ok(Vec::new()) };
+    let mut out = of(first)?;
+    if out.is_empty() {
+        return Ok(out);
+    }
+    out.extend(of(truths)?);
+    if renders.len() > 1 {
+        let share = 1.0 / renders.len() as f32;
+        let mean = |view: usize| -> Vec<f32> {
+            (0..first[view].len()).map(|i| renders.iter().map(|r| share * r[view][i]).sum()).collect()
+        };
+        out.extend(of(&(0..first.len()).map(mean).collect::<Vec<_>>())?);
+    }
+    Ok(out)
 }
 
 /// A view of the Gaussians as a viewer shows it: clamped to the range of a picture. What is not a number stays so, and is
@@ -298,6 +342,19 @@ pub fn report(run: &Run, shared: &Shared, environment: &Environment) -> Result<R
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_view_is_unseen_where_no_input_looks_along_its_axis() {
+        let view = |degrees: f64| {
+            let (sin, cos) = degrees.to_radians().sin_cos();
+            let at = glam::DVec3::new(2.0 * cos, 2.0 * sin, 0.3);
+            let camera = freerange_camera::Camera::look_at(at, glam::DVec3::ZERO, glam::DVec3::Z, 0.8, 4, 4);
+            View { name: String::new(), camera, image: image::RgbaImage::new(4, 4) }
+        };
+        let inputs = [view(0.0), view(30.0)];
+        let unseen = [0.0, 45.0, 89.0, 95.0, 180.0, 302.0, 290.0].map(|d| is_unseen(&view(d), &inputs));
+        assert_eq!(unseen, [false, false, false, true, true, false, true]);
+    }
 
     #[test]
     fn disagreement_is_the_mean_standard_deviation() {

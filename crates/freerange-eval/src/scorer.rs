@@ -109,6 +109,26 @@ impl Scorer {
         &self.used
     }
 
+    /// What is compared by the Frechet distance of [`Metric::FrechetVgg`]: VGG16's features of each image (`[height, width, 3]` in
+    /// 0..1, with its width and height), one after the other. Empty if that is not computed.
+    ///
+    /// # Errors
+    /// If an image has another size or a value that is not finite.
+    #[cfg(feature = "networks")]
+    pub fn vgg_features(&self, images: &[(&[f32], [usize; 2])]) -> Result<Vec<f32>, EvalError> {
+        let each = images.iter().map(|(image, [width, height])| self.networks.vgg_features(image, *width, *height));
+        Ok(each.collect::<Result<Option<Vec<_>>, _>>()?.unwrap_or_default().concat())
+    }
+
+    /// Empty: this program was built without networks.
+    ///
+    /// # Errors
+    /// None.
+    #[cfg(not(feature = "networks"))]
+    pub fn vgg_features(&self, _: &[(&[f32], [usize; 2])]) -> Result<Vec<f32>, EvalError> {
+        Ok(Vec::new())
+    }
+
     /// The scores of pairs, each at its own size.
     ///
     /// # Errors
@@ -192,6 +212,32 @@ pub fn fid(features: impl Iterator<Item = Result<Vec<f32>, EvalError>>) -> Resul
 #[cfg(not(feature = "networks"))]
 pub fn fid(mut features: impl Iterator<Item = Result<Vec<f32>, EvalError>>) -> Result<Option<f64>, EvalError> {
     features.try_for_each(|case| case.map(drop)).map(|()| None)
+}
+
+/// Frechet distance between two sets of [VGG16's features](Scorer::vgg_features). `None` of fewer than two images.
+///
+/// # Errors
+/// If features are not finite.
+#[cfg(feature = "networks")]
+pub fn frechet_vgg(renders: &[&[f32]], truths: &[&[f32]]) -> Result<Option<f64>, EvalError> {
+    use freerange_metrics::{FeatureStatistics, VGG_WIDTH, frechet_distance};
+    let statistics = |vectors: &[&[f32]]| {
+        let mut all = FeatureStatistics::new(VGG_WIDTH);
+        vectors.iter().try_for_each(|vector| all.add(vector)).map(|()| all)
+    };
+    match renders.len() < 2 {
+        true => Ok(None),
+        false => Ok(Some(frechet_distance(&statistics(renders)?, &statistics(truths)?)?)),
+    }
+}
+
+/// `None`: this program was built without networks.
+///
+/// # Errors
+/// None.
+#[cfg(not(feature = "networks"))]
+pub fn frechet_vgg(_: &[&[f32]], _: &[&[f32]]) -> Result<Option<f64>, EvalError> {
+    Ok(None)
 }
 
 #[cfg(all(test, feature = "networks"))]

@@ -25,6 +25,7 @@ fn measured(psnr: f64, hash: &str) -> Measured {
         validation_sha256: hash.into(),
         samples,
         features: 0,
+        vgg: None,
         picture: false,
         notes: Vec::new(),
         commit: "abc".into(),

@@ -23,7 +23,7 @@ pub use frechet::{FeatureStatistics, frechet_distance};
 pub use metric::Metric;
 #[cfg(feature = "networks")]
 pub use networks::{
-    Evaluator, EvaluatorConfig, Inception, Lpips, LpipsNet, NotComputed, Pair, Scores, cosine_similarity,
+    Evaluator, EvaluatorConfig, Inception, Lpips, LpipsNet, NotComputed, Pair, Scores, VGG_WIDTH, cosine_similarity,
 };
 pub use pixel::{l1, mse, psnr, psnr_from_mse};
 pub use ssim::{photometric_loss, ssim_3dgs, ssim_with_gradient};

@@ -4,7 +4,7 @@ use std::{fmt, str::FromStr};
 
 use crate::MetricsError;
 
-/// A measure of how alike two images are ([`Fid`](Self::Fid): two sets of images).
+/// A measure of how alike two images are (of [`Fid`](Self::Fid) and [`FrechetVgg`](Self::FrechetVgg) two sets of images).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 #[non_exhaustive]
 pub enum Metric {
@@ -28,11 +28,14 @@ pub enum Metric {
     DreamSimDino,
     /// Frechet distance of Inception-v3 features between the set of renders and the set of true images.
     Fid,
+    /// The same distance of VGG16's deepest features (those of LPIPS). Not FID, and no number of one compares with the other:
+    /// a stand-in where Inception's weights cannot be had.
+    FrechetVgg,
 }
 
 impl Metric {
     /// Every metric.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 11] = [
         Self::Psnr,
         Self::Ssim,
         Self::SsimCropped,
@@ -43,6 +46,7 @@ impl Metric {
         Self::DreamSim,
         Self::DreamSimDino,
         Self::Fid,
+        Self::FrechetVgg,
     ];
 
     /// The name in commands and in JSON.
@@ -58,6 +62,7 @@ impl Metric {
             Self::DreamSim => "dreamsim",
             Self::DreamSimDino => "dreamsim-dino",
             Self::Fid => "fid",
+            Self::FrechetVgg => "frechet-vgg",
         }
     }
 
@@ -74,6 +79,7 @@ impl Metric {
             Self::DreamSim => "DreamSim",
             Self::DreamSimDino => "DreamSim (DINO)",
             Self::Fid => "FID",
+            Self::FrechetVgg => "Frechet distance (VGG16)",
         }
     }
 
@@ -84,7 +90,7 @@ impl Metric {
 
     /// Whether one pair of images has a value; else only two sets of images have one.
     pub fn is_per_pair(self) -> bool {
-        self != Self::Fid
+        !matches!(self, Self::Fid | Self::FrechetVgg)
     }
 
     /// Whether the metric needs a network and its weights.

@@ -112,6 +112,14 @@ pub fn run(command: &Command) -> Result<(), CliError> {
 struct InfoJson<'a> {
     #[serde(flatten)]
     info: &'a ModelInfo,
+    /// What its tokens stand for.
+    kind: &'a str,
+    /// Objects that a checkpoint was trained on, counting repetitions.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    samples: Option<f64>,
+    /// How long that took.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    training_seconds: Option<f64>,
     /// The published weights that a checkpoint's frozen encoder had in training.
     #[serde(skip_serializing_if = "Option::is_none")]
     encoder_weights: Option<&'a WeightsOrigin>,
@@ -142,7 +150,14 @@ fn info(args: &Info) -> Result<(), CliError> {
     let info = ModelInfo::with_execution(&model, workload, execution);
     if args.json {
         let encoder_weights = provenance.as_ref().and_then(|(_, origin)| origin.as_ref());
-        let json = serde_json::to_string_pretty(&InfoJson { info: &info, encoder_weights });
+        let fact = |name: &str| provenance.as_ref().and_then(|(provenance, _)| provenance.get(name)?.as_f64());
+        let json = serde_json::to_string_pretty(&InfoJson {
+            info: &info,
+            kind: model.kind.name(),
+            samples: fact("samples"),
+            training_seconds: fact("training_seconds"),
+            encoder_weights,
+        });
         println!("{}", json.map_err(CliError::input)?);
         return Ok(());
     }

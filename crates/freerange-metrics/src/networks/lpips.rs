@@ -121,6 +121,13 @@ impl Lpips {
         out
     }
 
+    /// Activations of the last layer, averaged over its pixels. `images`: `[b, 3, h, w]` in 0..1. `[b, channels]`
+    pub(crate) fn deepest(&self, images: Tensor<4>) -> Tensor<2> {
+        let deepest = self.features(images).pop().expect("a backbone has layers");
+        let [b, channels, h, w] = deepest.dims();
+        deepest.reshape([b, channels, h * w]).mean_dim(2).reshape([b, channels])
+    }
+
     /// The distances of `b` pairs of images in 0..1, both `[b, 3, h, w]`; 0 for equal images. `[b]`
     ///
     /// # Panics

@@ -57,6 +57,11 @@ pub struct Pair<'a> {
     pub truth: &'a [f32],
 }
 
+/// Features of VGG16's last convolution.
+pub const VGG_WIDTH: usize = 512;
+/// Side, in pixels, of the images that VGG16 was trained on.
+const VGG_SIDE: usize = 224;
+
 /// What one pair gave.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scores {
@@ -79,6 +84,7 @@ pub struct Evaluator {
     dino: Option<Dino>,
     dreamsim: Vec<(Metric, DreamSim)>,
     inception: Option<Inception>,
+    vgg: Option<Lpips>,
     used: Vec<UsedFile>,
 }
 
@@ -100,6 +106,7 @@ impl Evaluator {
             dino: None,
             dreamsim: Vec::new(),
             inception: None,
+            vgg: None,
             used: Vec::new(),
         };
         let mut missing = Vec::new();
@@ -143,6 +150,10 @@ impl Evaluator {
                 self.dreamsim.push((metric, DreamSim::load_dino(&f[0], &f[1], &device)?));
             }
             Metric::Fid => self.inception = Some(Inception::load(&files("fid")?[0], &device)?),
+            Metric::FrechetVgg => {
+                let f = files("lpips-vgg")?;
+                self.vgg = Some(Lpips::load(LpipsNet::Vgg, &f[0], &f[1], &device)?);
+            }
         }
         Ok(())
     }
@@ -155,6 +166,24 @@ impl Evaluator {
     /// The files of weights that were read, for reports.
     pub fn used_files(&self) -> &[UsedFile] {
         &self.used
+    }
+
+    /// VGG16's features of an image, `[height, width, 3]` in 0..1, for [`Metric::FrechetVgg`]; none if that was not asked for:
+    /// activations of the last convolution, averaged over its pixels, [`VGG_WIDTH`] numbers. The image is rounded to 8 bits and
+    /// resized to 224 x 224 bilinearly, as Inception's are to theirs.
+    ///
+    /// # Errors
+    /// If the image has another size, or a value that is no finite number.
+    pub fn vgg_features(&self, image: &[f32], width: usize, height: usize) -> Result<Option<Vec<f32>>, MetricsError> {
+        let Some(vgg) = &self.vgg else { return Ok(None) };
+        check_size(image, image, width, height)?;
+        if let Some(index) = image.iter().position(|v| !v.is_finite()) {
+            return Err(MetricsError::NotFinite { image: "image", index, value: image[index].to_string() });
+        }
+        let mut planes = Vec::with_capacity(CHANNELS * VGG_SIDE * VGG_SIDE);
+        Image8::quantised(image, width, height).append_bilinear(VGG_SIDE, VGG_SIDE, &mut planes);
+        let pixels = Tensor::from_data(TensorData::new(planes, [1, CHANNELS, VGG_SIDE, VGG_SIDE]), &self.device);
+        Ok(Some(host(vgg.deepest((pixels + 1.0) / 2.0))))
     }
 
     /// The scores of pairs of one size.

@@ -4,12 +4,13 @@ mod ablations;
 mod args;
 mod compare;
 mod methods;
+mod paper_tables;
 mod sources;
 
 use std::path::{Path, PathBuf};
 
 use freerange_eval::{
-    Report, RunFolder,
+    FrechetVgg, Report, RunFolder,
     record::style,
     runner::{Event, Run, Shared, line, report},
 };
@@ -39,11 +40,16 @@ enum Command {
     Compare(compare::Args),
     /// Measure what each setting of sampling is worth, on one checkpoint and one source of objects.
     Ablations(Box<ablations::Args>),
+    /// Write the paper's four tables, its numbers beside those of rows that were trained and evaluated here.
+    PaperTables(paper_tables::Args),
 }
 
 pub fn run(args: &Args) -> Result<(), CliError> {
     if let Some(Command::Compare(args)) = &args.command {
         return compare::run(args);
+    }
+    if let Some(Command::PaperTables(args)) = &args.command {
+        return paper_tables::run(args);
     }
     let shared = match &args.command {
         Some(Command::Ablations(args)) => args.is_shared(),
@@ -144,6 +150,13 @@ fn print(report: &Report, output: &Path) {
         }
         if let Some(fid) = group.fid {
             text += &format!("  FID {fid:.2}");
+        }
+        if let Some(FrechetVgg { sample, mean, unseen_sample, unseen_mean, .. }) = group.frechet_vgg {
+            let text_of = |value: Option<f64>| value.map_or("-".into(), |v| format!("{v:.2}"));
+            text += &format!("  Frechet (VGG16) {sample:.2}, unseen {}", text_of(unseen_sample));
+            if mean.is_some() {
+                text += &format!(", of means {}, unseen {}", text_of(mean), text_of(unseen_mean));
+            }
         }
         println!("{text}  {:.1} s", group.seconds);
     }

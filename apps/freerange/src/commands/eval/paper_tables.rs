@@ -1,0 +1,33 @@
+//! `freerange eval paper-tables`
+
+use std::path::PathBuf;
+
+use freerange_core::{IoError, write_atomically};
+use freerange_eval::paper_tables::PaperTables;
+
+use crate::error::CliError;
+
+/// Arguments of `eval paper-tables`.
+#[derive(clap::Args)]
+pub struct Args {
+    /// Folder with a folder of evaluations for each row, as `tools/tables.sh` makes it.
+    rows: PathBuf,
+    /// Write the tables to this Markdown file instead of standard output.
+    #[arg(short, long, value_name = "FILE")]
+    output: Option<PathBuf>,
+    /// Seed of the bootstrap.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+}
+
+pub fn run(args: &Args) -> Result<(), CliError> {
+    let text = PaperTables::read(&args.rows, args.seed)?.markdown();
+    match &args.output {
+        None => print!("{}", text.trim_start()),
+        Some(path) => {
+            let text = text.trim_start().as_bytes();
+            write_atomically(path, |file| std::io::Write::write_all(file, text)).map_err(IoError::at(path))?;
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,101 @@
+//! The paper's tables from made-up evaluations.
+
+use std::{collections::BTreeMap, fs, path::Path};
+
+use freerange_eval::{
+    Environment, Features, Report, RunFolder,
+    paper_tables::PaperTables,
+    record::{Case, Measured, Outcome, Record, SampleScores, VggFeatures, ViewScores, ViewSet, means},
+};
+use serde_json::json;
+
+const OBJECTS: usize = 12;
+/// Numbers that a view has instead of VGG16's 512 features, where no network looks.
+const WIDTH: usize = if cfg!(feature = "networks") { 512 } else { 2 };
+
+/// An evaluation whose PSNR are `full` and `partial`, give or take what differs between objects, and whose features of unseen
+/// views are off by `shift`.
+fn evaluation(folder: &Path, full: f64, partial: f64, inputs: usize, shift: f32) {
+    let run = RunFolder::open(folder, &json!({}), false).unwrap();
+    let mut records = Vec::new();
+    for object in 0..OBJECTS {
+        for (views, psnr) in [(ViewSet::Full, full), (ViewSet::Partial, partial)] {
+            let case = Case { object: format!("o{object:02}"), views, inputs };
+            let psnr = psnr + 0.02 * (object as f64 - 5.5);
+            let values = BTreeMap::from([("psnr".to_owned(), psnr), ("ssim".to_owned(), 0.9)]);
+            let views = ["a", "b"].map(|name| ViewScores { name: name.into(), values: values.clone() }).to_vec();
+            let samples = vec![SampleScores { seed: 0, gaussians: 1024, views }];
+            let truth = |view: usize| (0..WIDTH).map(move |k| ((object * 5 + view * 3 + k) % 7) as f32 * 0.1);
+            let mut vgg: Vec<f32> = (0..2).flat_map(|view| truth(view).map(|x| x + shift)).collect();
+            vgg.extend((0..2).flat_map(truth));
+            let measured = Measured {
+                metrics: means(&samples),
+                seconds: 2.0,
+                peak_memory_bytes: None,
+                disagreement: None,
+                image_size: [8, 8],
+                inputs: vec!["a".into()],
+                validation_sha256: "h".into(),
+                samples,
+                features: 0,
+                vgg: Some(VggFeatures { count: vgg.len(), unseen: vec![true, false], samples: 1 }),
+                picture: false,
+                notes: Vec::new(),
+                commit: "c".into(),
+            };
+            let record = Record { case, outcome: Outcome::Measured(Box::new(measured)) };
+            run.write(&record, &Features { inception: Vec::new(), vgg }, None).unwrap();
+            records.push(record);
+        }
+    }
+    let nothing = BTreeMap::new();
+    let report = Report::new("m".into(), json!({}), Environment::default(), nothing, vec![], records, &run).unwrap();
+    run.write_json("report.json", &report).unwrap();
+}
+
+#[test]
+fn rows_stand_beside_the_papers_numbers_and_claims_are_answered() {
+    let place = tempfile::tempdir().unwrap();
+    let row = |name: &str| place.path().join(name).join("scans");
+    fs::create_dir_all(place.path().join("full")).unwrap();
+    evaluation(&row("full"), 25.0, 23.0, 4, 0.1);
+    evaluation(&row("full/inputs-2"), 22.0, 20.0, 2, 0.1);
+    evaluation(&row("full/no-cfg"), 24.8, 22.4, 4, 0.1);
+    evaluation(&row("no_flow_matching"), 25.5, 23.0, 4, 0.3);
+    evaluation(&row("pixel_aligned"), 26.0, 21.0, 4, 0.1);
+    let facts = json!({ "trainable": 7_433_756, "samples": 40_000, "training_seconds": 3600.0 });
+    fs::write(place.path().join("full/model.json"), facts.to_string()).unwrap();
+
+    let found = PaperTables::read(place.path(), 0).unwrap();
+    let answers: Vec<(&str, &str)> = found.claims.iter().map(|c| (&c.claim[..9], c.answer())).collect();
+    let mut expected = vec![("From one ", "yes"), ("Flow matc", "no"), ("Flow matc", "not decided")];
+    if cfg!(feature = "networks") {
+        expected.push(("One sampl", "yes"));
+    }
+    assert_eq!(answers, expected);
+    let lost = found.claims[0].difference;
+    assert!((lost.mean - 3.0).abs() < 1e-9 && lost.low <= lost.mean && lost.mean <= lost.high, "{lost:?}");
+    assert!(found.missing.iter().any(|m| m == "Random patching") && !found.missing.iter().any(|m| m == "Full"));
+
+    let text = found.markdown();
+    for line in [
+        "| Full | 7.43 M | 40000 | 1.00 | 1.0K | 2.00 | 25.00 |  |  |  | 23.00 |  |  |  |",
+        "| No flow matching |  |  |  | 1.0K | 2.00 | 25.50 | +0.50 |",
+        "| No classifier-free guidance (test time) | 7.43 M | 40000 | 1.00 | 1.0K | 2.00 | 24.80 | -0.20 |",
+        "| 2 | 28.22 | 22.00 |",
+        "| 4 | 31.49 | 25.00 |",
+        "| 6 | 32.04 |  |",
+        "GS-LRM (published) | 70K | 27.57 |",
+    ] {
+        assert!(text.contains(line), "{line}\n{text}");
+    }
+    assert!(text.contains("-3.09") && text.contains("Not measured yet: "), "{text}");
+}
+
+#[test]
+fn without_the_parent_row_there_are_no_tables() {
+    let place = tempfile::tempdir().unwrap();
+    evaluation(&place.path().join("no_curriculum/scans"), 20.0, 20.0, 4, 0.0);
+    let error = PaperTables::read(place.path(), 0).unwrap_err().to_string();
+    assert!(error.contains("full/SOURCE/report.json"), "{error}");
+}
