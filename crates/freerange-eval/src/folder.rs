@@ -175,6 +175,11 @@ impl RunFolder {
         self.numbers(case, VGG, count)
     }
 
+    /// Whether features of VGG16 were written with a case.
+    pub fn has_vgg_features(&self, case: &Case) -> bool {
+        self.file(case, VGG).is_file()
+    }
+
     fn numbers(&self, case: &Case, ending: &str, count: usize) -> Result<Vec<f32>, EvalError> {
         let file = self.file(case, ending);
         let bytes = fs::read(&file).map_err(IoError::at(&file))?;

@@ -6,7 +6,8 @@
 
 use std::{collections::BTreeMap, path::Path};
 
-use serde::Serialize;
+use freerange_core::IoError;
+use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::{
@@ -14,7 +15,7 @@ use crate::{
     compare::compare,
     folder::read_json,
     paper::{FULL, NUMBER_OF_VIEWS, PARTIAL, TEST_TIME, thousands},
-    record::{Case, ViewSet},
+    record::ViewSet,
     report::Group,
     scorer::frechet_vgg,
     statistics::{Interval, bootstrap, quantile},
@@ -25,6 +26,11 @@ use crate::{
 pub const PARENT: &str = "full";
 /// Resamples of the Frechet distance: each wants two roots of matrices.
 const FRECHET_RESAMPLES: usize = 200;
+
+/// The file of [claims](PaperTables::keep).
+const CLAIMS: &str = "claims.json";
+const FRECHET_CLAIM: &str =
+    "One sample of Full beats No flow matching in Frechet distance (VGG16) on views that no input saw";
 
 /// A row that this project knows of: its folder, its name in tables, the paper's PSNR on GSO, full and partial.
 type Known = (&'static str, &'static str, Option<[f64; 2]>);
@@ -49,6 +55,7 @@ pub const ROWS: [Known; 15] = [
 ];
 
 /// What is known of a row.
+#[derive(Clone, Debug)]
 struct Row {
     key: String,
     title: String,
@@ -60,7 +67,7 @@ struct Row {
 }
 
 /// An answer to one of the paper's claims.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Claim {
     /// What is claimed.
     pub claim: String,
@@ -92,6 +99,7 @@ pub struct PaperTables {
     pub claims: Vec<Claim>,
     /// Rows that have no evaluation yet.
     pub missing: Vec<String>,
+    rows: Vec<Row>,
 }
 
 impl PaperTables {
@@ -120,9 +128,15 @@ impl PaperTables {
         }
         tables.extend(views(place)?);
         let mut claims = Vec::new();
+        let kept: Vec<Claim> = match place.join(CLAIMS) {
+            file if file.is_file() => read_json(&file)?,
+            _ => Vec::new(),
+        };
         for source in full.reports.keys() {
             claims.extend(psnr_claims(&rows, full, source, seed)?);
-            claims.extend(frechet_claim(&rows, full, source, seed)?);
+            let own = |c: &&Claim| c.claim == FRECHET_CLAIM && c.source == *source;
+            let found = frechet_claim(&rows, full, source, seed)?;
+            claims.extend(found.or_else(|| kept.iter().find(own).cloned()));
         }
         if !claims.is_empty() {
             let mut table = Table::new("The paper's claims", &["claim", "objects", "answer", "difference", "interval"]);
@@ -142,7 +156,29 @@ impl PaperTables {
                 .collect();
             tables.insert(0, table);
         }
-        Ok(Self { tables, claims, missing })
+        for count in NUMBER_OF_VIEWS.map(|(count, _)| count).into_iter().filter(|count| *count != 4) {
+            rows.push(read_row(place, &format!("{PARENT}/inputs-{count}"), "", None)?);
+        }
+        Ok(Self { tables, claims, missing, rows })
+    }
+
+    /// Writes what the tables are made of to `place`, from where they can be made again: every report without the scores of
+    /// single views, what is known of checkpoints, and the claims, one of which rests on features that are not kept.
+    ///
+    /// # Errors
+    /// [`EvalError::Io`].
+    pub fn keep(&self, place: &Path) -> Result<(), EvalError> {
+        for row in &self.rows {
+            for (source, report) in &row.reports {
+                let folder = place.join(&row.key).join(source);
+                std::fs::create_dir_all(&folder).map_err(IoError::at(&folder))?;
+                RunFolder::existing(&folder).write_json("report.json", &report.without_views())?;
+            }
+            if let Some(model) = row.model.as_ref().filter(|_| !row.key.contains('/')) {
+                RunFolder::existing(&place.join(&row.key)).write_json("model.json", model)?;
+            }
+        }
+        RunFolder::existing(place).write_json(CLAIMS, &self.claims)
     }
 
     /// As Markdown, with what is missing.
@@ -376,16 +412,14 @@ fn unseen_features(row: &Row, source: &str) -> Result<BTreeMap<String, Unseen>, 
         return Ok(BTreeMap::new());
     };
     let mut out = BTreeMap::new();
-    for (Case { object, .. }, measured, case) in
-        report.measured().filter(|(c, _)| c.views == ViewSet::Partial).map(|(c, m)| (c, m, c))
-    {
-        let Some(kept) = &measured.vgg else { continue };
+    for (case, measured) in report.measured().filter(|(case, _)| case.views == ViewSet::Partial) {
+        let Some(kept) = measured.vgg.as_ref().filter(|_| folder.has_vgg_features(case)) else { continue };
         let parts = if kept.samples > 1 { 3 } else { 2 };
         let all = folder.vgg_features(case, kept.count)?;
         let width = kept.count / (parts * kept.unseen.len().max(1));
         let at = |part: usize, view: usize| all[(part * kept.unseen.len() + view) * width..][..width].to_vec();
         let views = (0..kept.unseen.len()).filter(|&i| kept.unseen[i]);
-        out.insert(object.clone(), views.map(|i| (at(0, i), at(1, i))).collect());
+        out.insert(case.object.clone(), views.map(|i| (at(0, i), at(1, i))).collect());
     }
     Ok(out)
 }
@@ -417,8 +451,7 @@ fn frechet_claim(rows: &[Row], full: &Row, source: &str, seed: u64) -> Result<Op
     }
     resampled.sort_unstable_by(f64::total_cmp);
     Ok(Some(Claim {
-        claim: "One sample of Full beats No flow matching in Frechet distance (VGG16) on views that no input saw"
-            .into(),
+        claim: FRECHET_CLAIM.into(),
         source: source.into(),
         difference: Interval { mean, low: quantile(&resampled, 0.025), high: quantile(&resampled, 0.975) },
         unit: String::new(),

@@ -90,6 +90,10 @@ fn rows_stand_beside_the_papers_numbers_and_claims_are_answered() {
         assert!(text.contains(line), "{line}\n{text}");
     }
     assert!(text.contains("-3.09") && text.contains("Not measured yet: "), "{text}");
+
+    let kept = tempfile::tempdir().unwrap();
+    found.keep(kept.path()).unwrap();
+    assert_eq!(PaperTables::read(kept.path(), 0).unwrap().markdown(), text);
 }
 
 #[test]

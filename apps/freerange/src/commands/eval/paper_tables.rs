@@ -15,13 +15,20 @@ pub struct Args {
     /// Write the tables to this Markdown file instead of standard output.
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
+    /// Also write what the tables are made of, without single views, to this folder: it takes the place of ROWS later.
+    #[arg(long, value_name = "DIR")]
+    keep: Option<PathBuf>,
     /// Seed of the bootstrap.
     #[arg(long, default_value_t = 0)]
     seed: u64,
 }
 
 pub fn run(args: &Args) -> Result<(), CliError> {
-    let text = PaperTables::read(&args.rows, args.seed)?.markdown();
+    let tables = PaperTables::read(&args.rows, args.seed)?;
+    if let Some(place) = &args.keep {
+        tables.keep(place)?;
+    }
+    let text = tables.markdown();
     match &args.output {
         None => print!("{}", text.trim_start()),
         Some(path) => {

@@ -1,0 +1,74 @@
+#!/usr/bin/env bash
+# Trains and evaluates the rows of the paper's tables (docs/results/paper-tables.md), in their order, and writes the tables.
+#
+#   tools/tables.sh BINARY PLACE [ROW...]
+#
+# BINARY is a release build of freerange with the feature `networks`. PLACE gets objects, runs and evaluations: a folder
+# outside of the checkout, with 4 GB to spare. Whatever is there already is continued, to the bit as if never stopped: run
+# the same command again after a kill. Without ROW all of them, in the order of the tables. Then what the tables are made
+# of goes to docs/results/paper-tables/ and the tables to docs/results/paper-tables/tables.md.
+#
+# FREERANGE_SHARED names the folder of the 21 objects (../shared); without it they are left out, with a line that says so.
+# WEIGHTS names the folder of LPIPS's weights (tools/lpips_weights.py makes it); without it LPIPS and the Frechet distance
+# are reported as not computed.
+# On two idle cores of an AMD EPYC with AVX-512 BF16 the objects take 45 minutes, a row about as long, and its evaluation
+# half of that (estimated).
+set -euo pipefail
+[ $# -ge 2 ] || { sed -n '2,/^set/p' "$0" | sed '$d'; exit 2; }
+binary=$(realpath "$1") place=$(realpath -m "$2")
+shift 2
+cd "$(dirname "$0")/.."
+rows=("$@")
+[ ${#rows[@]} -gt 0 ] || rows=(full full_seed2 no_flow_matching no_rendering no_curriculum no_patching_half no_patching
+  random_patches no_gradient_channels pixel_aligned voxel_aligned tree_coupling)
+objects=${OBJECTS:-3072} generated=${GENERATED:-100} steps=${STEPS:-} # smaller ones try the script
+shared=${FREERANGE_SHARED:-../shared}
+
+mkdir -p "$place/rows" "$place/runs"
+mkdir -p "$place/configs/tables" && cp configs/tables/*.toml "$place/configs/tables/"
+if [ -n "$steps" ]; then
+  sed -i -E "s/steps = [0-9]+( |,|$|\})/steps = $steps\1/" "$place"/configs/tables/*.toml
+fi
+echo "== objects"
+"$binary" data generate --objects "$objects" --first-seed 41000000 --gaussians fit --depths 7,8,9,10 \
+  -o "$place/shards/tables" --config configs/tables/full.toml
+
+# evaluate CHECKPOINT FOLDER VIEWS METRICS SAMPLES [OPTION...]: on generated objects and on the 21.
+evaluate() {
+  local checkpoint=$1 folder=$2 views=$3 metrics=$4 samples=$5
+  shift 5
+  local common=(--checkpoint "$checkpoint" --views "$views" --metrics "$metrics" --samples "$samples" --pictures none)
+  [ -z "${WEIGHTS:-}" ] || common+=(--weights "$WEIGHTS")
+  "$binary" eval "${common[@]}" "$@" --generated "$generated" --generated-size 256 -o "$folder/generated"
+  if [ "$views" = full ] && [[ " $* " == *" --inputs 9 "* ]]; then
+    return # the 21 have at most seven
+  fi
+  if [ -d "$shared/views" ]; then
+    "$binary" eval "${common[@]}" "$@" --scenes "$shared/views" -o "$folder/objects"
+  else
+    echo "== LEFT OUT: the 21 objects ($shared/views is not there)"
+  fi
+}
+
+for row in "${rows[@]}"; do
+  echo "== $row"
+  run=$place/runs/$row out=$place/rows/$row
+  "$binary" train "$place/configs/tables/$row.toml" -o "$run" --save-every 250
+  mkdir -p "$out"
+  cp "$run/log.jsonl" "$out/"
+  "$binary" model info "$run/checkpoint.safetensors" --json >"$out/model.json"
+  metrics=psnr,ssim,lpips-alex samples=1
+  case $row in
+    full) metrics+=,lpips-vgg,frechet-vgg samples=4 ;;
+    no_flow_matching | pixel_aligned | voxel_aligned) metrics+=,lpips-vgg,frechet-vgg ;; # one answer: no mean of several
+  esac
+  evaluate "$run/checkpoint.safetensors" "$out" both "$metrics" "$samples"
+  if [ "$row" = full ]; then
+    evaluate "$run/checkpoint.safetensors" "$out/no-cfg" both psnr,ssim,lpips-alex 1 --cfg-scale 1
+    evaluate "$run/checkpoint.safetensors" "$out/no-photometric" both psnr,ssim,lpips-alex 1 --lambda-pg 0
+    for inputs in 2 6 9; do
+      evaluate "$run/checkpoint.safetensors" "$out/inputs-$inputs" full psnr,ssim 1 --inputs "$inputs"
+    done
+  fi
+  "$binary" eval paper-tables "$place/rows" --keep docs/results/paper-tables -o docs/results/paper-tables/tables.md
+done
