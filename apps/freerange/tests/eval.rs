@@ -152,6 +152,16 @@ fn white_is_measured_resumed_refused_with_other_settings_and_restarted() {
     let message = expect(0, &run);
     assert!(message.contains("commit elsewhere") && message.contains("--restart"), "{message}");
 
+    // Nor is anything added to results whose settings meant something else.
+    let settings = Path::new(&out).join("settings.json");
+    let whole = fs::read_to_string(&settings).unwrap();
+    let mut json: Value = serde_json::from_str(&whole).unwrap();
+    let schema = json.as_object_mut().unwrap().remove("settings_schema").unwrap();
+    fs::write(&settings, json.to_string()).unwrap();
+    let message = expect(2, &run);
+    assert!(message.contains(&format!("settings_schema: nothing there, {schema} now")), "{message}");
+    fs::write(&settings, whole).unwrap();
+
     let other = [&run[..], &["--metrics", "psnr"]].concat();
     let message = expect(2, &other);
     assert!(message.contains("metrics") && message.contains("--restart"), "{message}");

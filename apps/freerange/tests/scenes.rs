@@ -97,6 +97,24 @@ fn many_scenes_are_made_once_and_a_bad_one_ends_none() {
         "{said}"
     );
     assert_eq!(changed(&out.join("a-bowl/gaussians.ply")), before);
+
+    // So is a record whose settings meant something else, or that does not say which they were.
+    let record = out.join("a-bowl/scene.json");
+    let whole = fs::read_to_string(&record).unwrap();
+    let mut json: Value = serde_json::from_str(&whole).unwrap();
+    for name in ["detail", "ensemble", "regroup", "polish"] {
+        assert!(json["options"][format!("sample.{name}")].is_string(), "{whole}");
+    }
+    let schema = json["options"].as_object_mut().unwrap().remove("settings_schema").unwrap();
+    fs::write(&record, json.to_string()).unwrap();
+    let (code, _, said) = made(&list, &out, &[]);
+    assert!(code == 2 && said.contains("`settings_schema`: expected nothing") && said.contains("--restart"), "{said}");
+    json["options"]["settings_schema"] = format!("{schema}0").into();
+    fs::write(&record, json.to_string()).unwrap();
+    let (code, _, said) = made(&list, &out, &[]);
+    assert!(code == 2 && said.contains("`settings_schema`: expected "), "{said}");
+    fs::write(&record, whole).unwrap();
+
     let (code, rows, said) = made(&list, &out, &["--seed", "3", "--restart", "--share", "0/2"]);
     assert_eq!((code, column(&rows, "scene")), (0, vec!["a-bowl", "b-bowl"]), "{said}");
     assert_eq!(column(&rows, "status"), ["done", "done"]);

@@ -80,6 +80,76 @@ fn outcome(run: &Path) -> (Vec<u8>, Vec<u8>, Vec<serde_json::Value>) {
     (weights("checkpoint.safetensors"), weights("best.safetensors"), lines.collect())
 }
 
+/// Waits until a run has saved this step.
+fn wait_for(run: &Path, step: u64) {
+    let begin = Instant::now();
+    while saved(run) < step {
+        assert!(begin.elapsed() < Duration::from_secs(300), "it makes no progress");
+        thread::sleep(Duration::from_millis(1));
+    }
+}
+
+#[cfg(unix)]
+fn ask_to_end(child: &Child) {
+    let asked = Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap();
+    assert!(asked.success());
+}
+
+/// A measurement takes as long as anything; nobody who is asked to end waits for it. Meanwhile nobody else trains there.
+#[cfg(unix)]
+#[test]
+fn asked_to_end_while_it_measures_it_ends_with_its_state() {
+    let place = tempfile::tempdir().unwrap();
+    let (config, run) = (place.path().join("train.toml"), place.path().join("run"));
+    let long =
+        CONFIG.replace("every = 5, objects = 1", "every = 2, objects = 1").replace("steps = 1\n", "steps = 10000\n");
+    assert!(long.contains("steps = 10000\n"));
+    fs::write(&config, long).unwrap();
+    let mut child = train(&config, &run, 1);
+    wait_for(&run, 1);
+    thread::sleep(Duration::from_millis(500));
+    assert!(child.try_wait().unwrap().is_none() && saved(&run) == 1, "it does not measure after step 2");
+
+    let second = Command::new(env!("CARGO_BIN_EXE_freerange"))
+        .args(["train".as_ref(), config.as_os_str(), "-o".as_ref(), run.as_os_str()])
+        .output()
+        .unwrap();
+    let error = String::from_utf8_lossy(&second.stderr);
+    assert!(second.status.code() == Some(2) && error.contains("another process trains in it"), "{error}");
+    assert_eq!(saved(&run), 1);
+
+    ask_to_end(&child);
+    let begin = Instant::now();
+    assert_eq!(child.wait().unwrap().code(), Some(130));
+    assert!(begin.elapsed() < Duration::from_secs(10), "it took {:?} to end", begin.elapsed());
+    assert_eq!(saved(&run), 2);
+    // The measurement is still due.
+    let mut child = train(&config, &run, 1);
+    thread::sleep(Duration::from_millis(1000));
+    assert!(child.try_wait().unwrap().is_none() && saved(&run) == 2);
+    child.kill().unwrap();
+    child.wait().unwrap();
+}
+
+#[test]
+fn a_measurement_that_fails_loses_no_step() {
+    let place = tempfile::tempdir().unwrap();
+    let path = |name: &str| -> PathBuf { place.path().join(name) };
+    fs::write(path("config.toml"), CONFIG.replace("steps = 60", "steps = 10")).unwrap();
+    assert!(train(&path("config.toml"), &path("whole"), 100).wait().unwrap().success());
+    let in_the_way = path("run/best.safetensors");
+    fs::create_dir_all(in_the_way.join("something")).unwrap();
+    for _ in 0..2 {
+        assert_eq!(train(&path("config.toml"), &path("run"), 100).wait().unwrap().code(), Some(2));
+        assert_eq!(saved(&path("run")), 5);
+    }
+    fs::remove_dir_all(&in_the_way).unwrap();
+    assert!(train(&path("config.toml"), &path("run"), 100).wait().unwrap().success());
+    let (expected, found) = (outcome(&path("whole")), outcome(&path("run")));
+    assert!(expected.0 == found.0 && expected.1 == found.1, "other weights");
+    assert_eq!(expected.2, found.2);
+}
+
 #[test]
 fn sums_between_cards_are_refused_where_they_cannot_be_made() {
     let place = tempfile::tempdir().unwrap();
@@ -158,16 +228,11 @@ fn killed_at_ten_points(config: &str) {
     #[cfg(unix)]
     {
         let run = path("asked");
-        let mut child = train(&path("config.toml"), &run, STEPS);
-        let begin = Instant::now();
-        while !run.join("log.jsonl").exists() {
-            assert!(begin.elapsed() < Duration::from_secs(300), "it does not begin");
-            thread::sleep(Duration::from_millis(1));
-        }
-        let asked = Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap();
-        assert!(asked.success());
+        let mut child = train(&path("config.toml"), &run, 1);
+        wait_for(&run, 3);
+        ask_to_end(&child);
         assert_eq!(child.wait().unwrap().code(), Some(130));
-        assert!((1..STEPS).contains(&saved(&run)), "asked to end, it saved step {}", saved(&run));
+        assert!((3..STEPS).contains(&saved(&run)), "asked to end, it saved step {}", saved(&run));
         assert!(train(&path("config.toml"), &run, STEPS).wait().unwrap().success());
         let found = outcome(&run);
         assert!(expected.0 == found.0 && expected.1 == found.1, "other weights after it was asked to end");

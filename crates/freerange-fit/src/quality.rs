@@ -14,8 +14,11 @@ const BEST_PSNR: f64 = 100.0;
 /// PSNR in dB of renders of `cloud` against `views`, in front of white: mean over the views.
 ///
 /// # Errors
-/// What the rasteriser refuses.
+/// [`FitError::NoViews`]; what the rasteriser refuses.
 pub fn psnr_over_white(cloud: &Cloud, views: &[View]) -> Result<f64, FitError> {
+    if views.is_empty() {
+        return Err(FitError::NoViews);
+    }
     let mut sum = 0.0;
     for view in views {
         sum += psnr(&render_over_white(cloud, &view.camera)?, &over_white(&view.image))?.min(BEST_PSNR);
@@ -44,6 +47,11 @@ pub fn over_white(image: &RgbaImage) -> Vec<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn no_views_have_no_mean() {
+        assert!(matches!(psnr_over_white(&Cloud::default(), &[]), Err(FitError::NoViews)));
+    }
 
     #[test]
     fn white_shows_through_transparency() {

@@ -63,7 +63,6 @@ pub struct DataConfig<M = ()> {
     pub workers: usize,
     /// Object number i belongs to lane i mod `lanes`, and each lane has its share of window, fresh objects and batch: whoever
     /// trains with as many processes as divide it trains the same, and each reads the objects of its own lanes only.
-    #[serde(skip_serializing_if = "is_one")]
     pub lanes: usize,
     /// Objects over which the normalisation statistics are measured before training.
     pub statistics_objects: usize,
@@ -126,7 +125,6 @@ pub struct LossConfig {
     /// Fewest and most input views; the number is drawn for each batch.
     pub input_views: (usize, usize),
     /// Batches that start from quick fits of their input views, which the objects must have; left out: none.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub start: Option<StartLoss>,
     /// Share of the batches in which the network is fed its own estimate, made without a gradient just before
     /// (`model.estimate_channels`).
@@ -140,7 +138,6 @@ pub struct LossConfig {
     /// How far the frame that an object is shown in is off its own. A user's frame is estimated from few views.
     pub frame_jitter: FrameJitter,
     /// Which other objects an object stands for, too: each time it is used, one of them is drawn.
-    #[serde(skip_serializing_if = "Symmetries::none")]
     pub symmetries: Symmetries,
 }
 
@@ -162,16 +159,8 @@ pub struct StartLoss {
     #[serde(default)]
     pub hold: f32,
     /// Weight of the rendering losses at the start; left out: that of its time, `w(t)`.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(default)]
     pub render: Option<f32>,
-}
-
-fn is_one(x: &usize) -> bool {
-    *x == 1
-}
-
-fn is_f32(wire: &Wire) -> bool {
-    *wire == Wire::F32
 }
 
 fn one() -> f32 {
@@ -198,12 +187,6 @@ pub struct Symmetries {
     pub space: bool,
     /// Permutations of red, green and blue: six objects of one.
     pub color: bool,
-}
-
-impl Symmetries {
-    fn none(&self) -> bool {
-        *self == Self::default()
-    }
 }
 
 impl Default for LossConfig {
@@ -257,7 +240,6 @@ pub struct OptimizerConfig {
     /// Arithmetic of the blocks, `f32`, `bf16` or `auto`, the faster on this device; weights and sums stay in 32 bits.
     pub compute: Compute,
     /// How gradients travel between ranks: `f32`, or `bf16` for half of the bytes.
-    #[serde(skip_serializing_if = "is_f32")]
     pub wire: Wire,
     /// Keep only the input of each block, and compute the block again for its gradient: a fraction of the memory for a
     /// third more work.
@@ -336,13 +318,13 @@ pub struct Stage {
     /// Objects per step.
     pub batch: usize,
     /// Objects that are computed at a time; gradients are averaged over a step's. Left out: all at once.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(default)]
     pub micro_batch: Option<usize>,
     /// Side, in pixels, of the images that the rendering losses compare; left out: `loss.render_size`.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(default)]
     pub render_size: Option<u32>,
     /// Side, in pixels, of the images that the network's gradient channels are taken on; left out: `loss.gradient_size`.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(default)]
     pub gradient_size: Option<u32>,
     /// Steps.
     pub steps: u64,

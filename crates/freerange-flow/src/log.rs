@@ -18,18 +18,19 @@ pub struct Log {
 }
 
 impl Log {
-    /// Opens the log of a run that is at `step`. Lines of later steps, which a killed process took without saving their
-    /// state, and a line that it did not finish go away.
+    /// Opens the log of a run that is at `step` and made its last measurement after step `measured`. Lines of what came
+    /// later, which a killed process did without saving its state, and a line that it did not finish go away.
     ///
     /// # Errors
     /// [`FlowError::Io`].
-    pub fn open(path: &Path, step: u64) -> Result<Self, FlowError> {
+    pub fn open(path: &Path, step: u64, measured: u64) -> Result<Self, FlowError> {
         let old = match std::fs::read(path) {
             Ok(old) => old,
             Err(e) if e.kind() == std::io::ErrorKind::NotFound => Vec::new(),
             Err(e) => return Err(IoError::at(path)(e).into()),
         };
-        let kept: Vec<&[u8]> = old.split_inclusive(|&b| b == b'\n').filter(|line| is_of(line, step)).collect();
+        let lines = old.split_inclusive(|&b| b == b'\n');
+        let kept: Vec<&[u8]> = lines.filter(|line| is_known(line, step, measured)).collect();
         if kept.iter().map(|line| line.len()).sum::<usize>() < old.len() {
             write_atomically(path, |file| kept.iter().try_for_each(|line| file.write_all(line)))
                 .map_err(IoError::at(path))?;
@@ -61,13 +62,15 @@ impl Log {
     }
 }
 
-/// Whether this is a whole line of a step up to `last`.
-fn is_of(line: &[u8], last: u64) -> bool {
+/// Whether this is a whole line of a step up to `last`, or of a measurement up to `measured`.
+fn is_known(line: &[u8], last: u64, measured: u64) -> bool {
     #[derive(serde::Deserialize)]
-    struct Step {
+    struct Line {
         step: u64,
+        validation: Option<serde::de::IgnoredAny>,
     }
-    line.ends_with(b"\n") && serde_json::from_slice::<Step>(line).is_ok_and(|found| found.step <= last)
+    let known = |line: Line| line.step <= if line.validation.is_some() { measured } else { last };
+    line.ends_with(b"\n") && serde_json::from_slice(line).is_ok_and(known)
 }
 
 #[cfg(test)]
@@ -79,18 +82,19 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("log.jsonl");
         let line = |step: u64| serde_json::json!({ "step": step, "loss": 0.5 });
-        let mut log = Log::open(&path, 0).unwrap();
+        let mut log = Log::open(&path, 0, 0).unwrap();
         (1..=3).for_each(|step| log.add(&line(step)).unwrap());
         log.sync().unwrap();
         let saved = std::fs::read(&path).unwrap();
-        // Killed after two steps more, in the middle of a line.
+        // Killed after a measurement, a step more, and in the middle of a line.
+        log.add(&serde_json::json!({ "step": 3, "validation": { "psnr": 20.0 } })).unwrap();
         log.add(&line(4)).unwrap();
         drop(log);
         let mut torn = std::fs::read(&path).unwrap();
         torn.extend(b"{\"step\":2,\"lo");
         std::fs::write(&path, torn).unwrap();
 
-        let mut log = Log::open(&path, 3).unwrap();
+        let mut log = Log::open(&path, 3, 0).unwrap();
         assert_eq!(std::fs::read(&path).unwrap(), saved);
         log.add(&line(4)).unwrap();
         drop(log);

@@ -15,7 +15,7 @@ use freerange_model::Checkpoint;
 use freerange_splat::{Cloud, channel};
 
 pub use self::{
-    config::{FromNoise, GradientAt, SampleConfig, StartConfig},
+    config::{FromNoise, GradientAt, SETTINGS_SCHEMA, SampleConfig, StartConfig},
     sampler::{PhotometricStep, classifier_free, scale_gradient},
     solver::{Solver, Step, integrate},
 };

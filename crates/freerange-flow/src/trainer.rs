@@ -11,7 +11,7 @@ mod step;
 #[cfg(test)]
 mod tests;
 
-use std::{path::PathBuf, rc::Rc};
+use std::{fs::File, ops::ControlFlow, path::PathBuf, rc::Rc};
 
 use burn::{module::Module, tensor::Device};
 use freerange_model::{Checkpoint, Compute, Dinov2, FreeRange, ModelConfig};
@@ -28,7 +28,8 @@ use crate::{
     config::TrainConfig,
     optimizer::AdamW,
     photometric::Photometric,
-    ranks::{Ranks, agree},
+    ranks::{Ranks, agree, gather},
+    sample::SETTINGS_SCHEMA,
     validation::{Figures, Validation},
     weights::Weights,
 };
@@ -48,10 +49,12 @@ pub struct Trainer {
     lanes: Vec<Lane>, // of this rank
     broken: u64,      // objects before those of all streams that could not be read
     stop_when: Box<dyn Fn() -> bool>,
+    interrupt_when: Box<dyn Fn() -> bool>,
     ahead: Option<Result<Batch, FlowError>>, // of the next step
     not_finite: u32,                         // steps in a row
     validation: Option<Validation>,
     folder: PathBuf,
+    _lock: Option<File>, // of the folder, on rank 0
 }
 
 impl Trainer {
@@ -74,26 +77,61 @@ impl Trainer {
         self.model.as_ref().expect("a step gives it back")
     }
 
-    /// Measures the averaged weights, if that is due after the steps so far; `best.safetensors` are those of the best
-    /// measurement.
-    pub fn validate(&mut self) -> Result<Option<Validated>, FlowError> {
+    /// Is asked between the parts of a step and between those of a measurement. Where it is so, they are given up: the step
+    /// of a single rank ends with [`FlowError::Cancelled`], a measurement of all ranks is made when the run goes on.
+    pub fn interrupt_when(&mut self, at_once: impl Fn() -> bool + 'static) {
+        self.interrupt_when = Box::new(at_once);
+    }
+
+    /// Whether all steps are taken, and the measurement after the last one is made.
+    pub fn is_finished(&self) -> bool {
+        self.progress.step == self.config.total_steps() && !self.measurement_is_due()
+    }
+
+    /// The step after which the last measurement was made; 0: none was.
+    pub fn measured(&self) -> u64 {
+        self.progress.measured.unwrap_or(0)
+    }
+
+    fn measurement_is_due(&self) -> bool {
         let (step, every) = (self.progress.step, self.config.validation.every);
-        let Some(validation) = self.validation.as_ref().filter(|_| step > 0 && step.is_multiple_of(every)) else {
-            return Ok(None);
+        self.validation.is_some() && step > self.measured() && step.is_multiple_of(every)
+    }
+
+    /// Measures the averaged weights, if that is due after the steps so far; `best.safetensors` are those of the best
+    /// measurement. Where a run was saved without a measurement that is due, it is made when the run goes on.
+    ///
+    /// `Break`: [`interrupt_when`](Self::interrupt_when) said so on a rank, and nothing was measured.
+    ///
+    /// # Errors
+    /// The same as of sampling; [`FlowError::Io`]; [`FlowError::Elsewhere`]; [`FlowError::Ranks`].
+    pub fn validate(&mut self) -> Result<ControlFlow<(), Option<Validated>>, FlowError> {
+        let Some(validation) = self.validation.as_ref().filter(|_| self.measurement_is_due()) else {
+            return Ok(ControlFlow::Continue(None));
         };
+        let step = self.progress.step;
         let tracked = self.average.apply(self.model().clone()).put_dinov2(self.frozen.clone());
         let checkpoint = self.checkpoint(self.averaged())?;
         let stage = self.config.stage(step - 1);
-        let own = validation.measure(&checkpoint, &tracked, &self.config, stage, &self.device);
-        let (own, pictures) = agree(&*self.ranks, own)?;
+        let interrupted = &*self.interrupt_when;
+        let own = match validation.measure(&checkpoint, &tracked, &self.config, stage, &self.device, interrupted) {
+            Err(FlowError::Cancelled) => Ok(None),
+            own => own.map(Some),
+        };
+        let own = agree(&*self.ranks, own)?;
+        let given_up = gather(&*self.ranks, &[u8::from(own.is_none())])?.contains(&vec![1]);
+        let Some((own, pictures)) = own.filter(|_| !given_up) else { return Ok(ControlFlow::Break(())) };
         let figures = Figures { pictures, ..Figures::of(&*self.ranks, own)? };
         let found = Best { step, psnr: figures.psnr };
-        let best = self.progress.best.filter(|best| best.psnr >= found.psnr).unwrap_or(found);
-        if best == found && self.ranks.rank() == 0 {
-            checkpoint.save(&self.folder.join("best.safetensors"))?;
+        if found.is_better_than(self.progress.best) {
+            let path = self.folder.join("best.safetensors");
+            let saved = if self.ranks.rank() == 0 { checkpoint.save(&path) } else { Ok(()) };
+            agree(&*self.ranks, saved.map_err(FlowError::from))?;
+            self.progress.best = Some(found);
         }
-        self.progress.best = Some(best);
-        Ok(Some(Validated { step, seen_samples: self.samples(), validation: figures, best }))
+        self.progress.measured = Some(step);
+        let best = self.progress.best;
+        Ok(ControlFlow::Continue(Some(Validated { step, seen_samples: self.samples(), validation: figures, best })))
     }
 
     /// The model with the averaged weights. Sampling chooses its own arithmetic.
@@ -116,6 +154,7 @@ impl Trainer {
             "samples": self.samples(),
             "training_seconds": self.progress.seconds,
             "program": concat!("freerange ", env!("CARGO_PKG_VERSION")),
+            "settings_schema": SETTINGS_SCHEMA,
             "sample": self.config.sample,
         });
         Ok(Checkpoint {

@@ -7,6 +7,7 @@ use freerange_camera::{
     View,
     image_ops::{composite, sheet, to_picture},
 };
+use freerange_core::Invalid;
 use freerange_data::{Object, ObjectSource};
 use freerange_fit::psnr_over_white;
 use freerange_model::{Checkpoint, FreeRange, ModelConfig};
@@ -20,7 +21,7 @@ use crate::{
     config::{Stage, TrainConfig},
     photometric::Photometric,
     ranks::{Ranks, gather},
-    sample::{SampleConfig, reconstruct},
+    sample::{Estimate, SampleConfig, reconstruct},
     train,
 };
 
@@ -157,7 +158,22 @@ impl Validation {
         Ok(Self { objects, seed })
     }
 
+    /// Refuses objects of which no sample could ever be compared with anything, on no rank: a run would have no best weights.
+    pub fn require_comparisons<M>(&self, ranks: &dyn Ranks, config: &TrainConfig<M>) -> Result<(), FlowError> {
+        let own = self.objects.iter().any(|(number, object)| !self.tasks(object, config, *number).is_empty());
+        if gather(ranks, &[u8::from(own)])?.contains(&vec![1]) {
+            return Ok(());
+        }
+        let fits = "initial fits of their input views, which sample.start begins with (data.object.input_fits), and ";
+        let fits = if config.sample.start.is_some() { fits } else { "" };
+        let expected = format!("objects with {fits}views beside the input views to compare with");
+        Err(Invalid::new("validation.objects", expected, "none").into())
+    }
+
     /// Measures `checkpoint`, whose weights are also in `tracked`, a model on a differentiating device.
+    ///
+    /// # Errors
+    /// [`FlowError::Cancelled`] where `interrupted` says so, which is asked before every object and step of sampling.
     pub fn measure(
         &self,
         checkpoint: &Checkpoint,
@@ -165,12 +181,16 @@ impl Validation {
         config: &TrainConfig,
         stage: &Stage,
         device: &Device,
+        interrupted: &dyn Fn() -> bool,
     ) -> Result<(Vec<Measured>, Vec<RgbaImage>), FlowError> {
         let photometric = Photometric::new(&checkpoint.normalization, device);
         let rms = Tensor::<1>::from_floats(checkpoint.gradient_rms, device).reshape([1, 1, channel::COUNT]);
         let model_config = ModelConfig { image_size: stage.image_size, ..config.model.clone() };
         let (mut measured, mut pictures) = (Vec::new(), Vec::new());
         for (number, object) in &self.objects {
+            if interrupted() {
+                return Err(FlowError::Cancelled);
+            }
             // Times, noise and views are the same every time.
             let mut rng = step_rng(self.seed, *number);
             let one = std::slice::from_ref(object);
@@ -187,9 +207,9 @@ impl Validation {
                 let sample = SampleConfig { depth, ..config.sample.clone() };
                 let fits = fit.map(|fit| [fit]);
                 let fits = fits.as_ref().map(<[Cloud; 1]>::as_slice);
-                let found = reconstruct(checkpoint, &[&inputs], fits, &sample, &[self.seed], device, |_| {
-                    ControlFlow::Continue(())
-                })?;
+                let go_on =
+                    |_: &Estimate| if interrupted() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) };
+                let found = reconstruct(checkpoint, &[&inputs], fits, &sample, &[self.seed], device, go_on)?;
                 psnr.push(psnr_over_white(&found[0][0], &others)?);
                 if pictures.len() < PICTURED.0 {
                     pictures.push(picture(&found[0][0], &others)?);
@@ -200,25 +220,30 @@ impl Validation {
         Ok((measured, pictures))
     }
 
-    /// Input views, views to compare with, and the fit to start from: each of the object's fits where sampling starts from
-    /// one, else one choice of views.
-    fn tasks(&self, object: &Object, config: &TrainConfig, number: u64) -> Vec<(Vec<View>, Vec<View>, Option<Cloud>)> {
+    /// What is sampled of an object: from each of its fits where sampling starts from one, else from one choice of views.
+    /// Nothing where no view is left to compare with.
+    fn tasks<M>(&self, object: &Object, config: &TrainConfig<M>, number: u64) -> Vec<Task> {
         let (fewest, most) = config.loss.input_views;
         let of = |(chosen, rest): (Vec<&View>, Vec<&View>), fit| {
             let views = |views: Vec<&View>| views.into_iter().cloned().collect::<Vec<View>>();
             (views(chosen), views(rest.into_iter().take(COMPARED).collect()), fit)
         };
-        if config.sample.start.is_none() {
+        let tasks = if config.sample.start.is_none() {
             let mut rng = step_rng(!self.seed, number);
             let count = 4usize.clamp(fewest, most);
-            return vec![of(choose_views(&object.views, count, false, &mut rng), None)];
-        }
-        let fits = object.input_fits.iter().take(2); // around the object, and from one side
-        fits.map(|fit| {
-            let (chosen, rest) = (0..object.views.len()).partition::<Vec<usize>, _>(|i| fit.views.contains(i));
-            let [chosen, rest] = [chosen, rest].map(|set| set.into_iter().map(|i| &object.views[i]).collect());
-            of((chosen, rest), Some(fit.gaussians.clone()))
-        })
-        .collect()
+            vec![of(choose_views(&object.views, count, false, &mut rng), None)]
+        } else {
+            let fits = object.input_fits.iter().take(2); // around the object, and from one side
+            let fits = fits.map(|fit| {
+                let (chosen, rest) = (0..object.views.len()).partition::<Vec<usize>, _>(|i| fit.views.contains(i));
+                let [chosen, rest] = [chosen, rest].map(|set| set.into_iter().map(|i| &object.views[i]).collect());
+                of((chosen, rest), Some(fit.gaussians.clone()))
+            });
+            fits.collect()
+        };
+        tasks.into_iter().filter(|(_, rest, _)| !rest.is_empty()).collect()
     }
 }
+
+/// Input views, views to compare with, and the fit to start from.
+type Task = (Vec<View>, Vec<View>, Option<Cloud>);

@@ -91,7 +91,6 @@ pub struct ModelConfig {
     /// Attention heads; divides `hidden`.
     pub heads: usize,
     /// Inner width of the feed-forward network; 4 x `hidden` where left out.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub ffn: Option<usize>,
     /// Learned tokens that belong to neither image nor Gaussian.
     pub registers: usize,
@@ -117,12 +116,10 @@ pub struct ModelConfig {
     pub observation_channels: bool,
     /// Whether it is also told where each Gaussian of that estimate lies with respect to what the input views show: their outlines, the
     /// surface, colours that agree (not the paper's). Needs `observation_channels`.
-    #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub place_channels: bool,
     /// With these, the last layer tells but the correction, of unit variance at all times, to what the noisy Gaussians and
     /// the earlier estimate say together (preconditioning: Karras et al. 2022; not the paper's): standard deviations, one
     /// per channel, of what such estimates are off by, in normalised units. Without an estimate they are 1.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub preconditioning: Option<[f32; CHANNELS]>,
 }
 
@@ -177,10 +174,8 @@ pub struct Dinov2Config {
     /// Where training finds the published weights: a folder as the Hugging Face hub has it (`config.json` and
     /// `model.safetensors`; in a file, its path is relative to the file), or `hf:owner/name`. A checkpoint has none of
     /// this: it records the weights that it was trained with.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub weights: Option<String>,
     /// Random weights instead, for dry runs of training. What is trained on them is of no use.
-    #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub random: bool,
 }
 

@@ -46,7 +46,7 @@ pub use checkpoint::{
 pub use device::{Api, DeviceName, Listed, Properties, devices, require};
 pub use error::Error;
 pub use freerange_camera::{Camera, FrameConfig, Scene, Similarity, Up, View};
-pub use freerange_flow::sample::{SampleConfig, Solver, StartConfig};
+pub use freerange_flow::sample::{SETTINGS_SCHEMA, SampleConfig, Solver, StartConfig};
 pub use freerange_model::{Checkpoint, Compute};
 pub use freerange_splat::{Cloud, write_ply};
 pub use options::Options;

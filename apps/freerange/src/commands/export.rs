@@ -49,6 +49,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         "library_name": "freerange",
         "gaussians": gaussians,
         "architecture": checkpoint.config,
+        "settings_schema": checkpoint.provenance.get("settings_schema"),
         "sample": checkpoint.provenance.get("sample"),
     });
     let output = OutputFolder::create("model export", &args.output)?;

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use freerange::{EncoderPlaces, checkpoint_header, load_checkpoint, sampling};
+use freerange::{EncoderPlaces, SETTINGS_SCHEMA, checkpoint_header, load_checkpoint, sampling};
 use freerange_model::{Compute, Execution, ModelConfig, ModelInfo, WeightsOrigin, Workload};
 
 use crate::{
@@ -101,6 +101,7 @@ pub fn run(command: &Command) -> Result<(), CliError> {
                     return Err(CliError::file(&args.input, problem));
                 };
                 provenance.insert("sample".into(), sample);
+                provenance.insert("settings_schema".into(), SETTINGS_SCHEMA.into());
             }
             Ok(checkpoint.save_as(&args.output, freerange_model::Precision::F16)?)
         }

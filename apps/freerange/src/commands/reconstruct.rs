@@ -10,7 +10,8 @@ use std::{
 };
 
 use freerange::{
-    Compute, Device, DeviceName, EncoderPlaces, Options, Reconstructor, SampleConfig, Scores, Solver, Stage, View,
+    Compute, Device, DeviceName, EncoderPlaces, Options, Reconstructor, SETTINGS_SCHEMA, SampleConfig, Scores, Solver,
+    Stage, View,
     pictures::{on_white, render_view, write_turntable},
     score, write_ply,
 };
@@ -259,6 +260,7 @@ impl Watch {
 struct SceneReport {
     scene: PathBuf,
     notes: Vec<String>,
+    settings_schema: u32,
     sampling: SampleConfig,
     /// Names of the views that the model was shown.
     views_shown: Vec<String>,
@@ -389,6 +391,7 @@ fn reconstruct(
     let report = SceneReport {
         scene: path.into(),
         notes,
+        settings_schema: SETTINGS_SCHEMA,
         sampling: options.sample,
         views_shown: result.shown.iter().map(|&i| inputs[i].name.clone()).collect(),
         held_out,

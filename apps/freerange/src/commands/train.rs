@@ -1,11 +1,12 @@
 //! `freerange train`
 
+mod interrupt;
+mod journal;
+mod run;
+
 use std::{
     path::{Path, PathBuf},
-    sync::{
-        Arc,
-        atomic::{AtomicBool, Ordering},
-    },
+    sync::Arc,
     time::{Duration, Instant},
 };
 
@@ -15,19 +16,17 @@ use freerange_core::sha256_of;
 use freerange_flow::{
     FlowError,
     batch::step_rng,
-    events::Events,
-    log::Log,
-    trainer::{Among, Initial, StepReport, Trainer, Validated},
+    trainer::{Among, Initial, Trainer},
 };
 
 use freerange_model::{Compute, Execution, FreeRange, ModelConfig, ModelInfo, Workload};
 
+use self::{interrupt::Interrupt, journal::Journal, run::Run};
 use crate::{
     error::CliError,
-    progress::Progress,
     ranks::{Job, Sums},
     runtime::{TrainConfig, commit, local_or_shipped},
-    signals::{EXIT_CODE, Signals},
+    signals::Signals,
 };
 
 /// Train a model. Run the same command again to go on where it was stopped.
@@ -122,128 +121,28 @@ fn train(args: &Args, job: &Job, interrupt: &Arc<Interrupt>, begin: Instant) -> 
     let mut trainer = job.together(trainer.map_err(CliError::from))?;
     let allowed = args.minutes.and_then(|minutes| Duration::try_from_secs_f64(60.0 * minutes.max(0.0)).ok());
     let over = allowed.and_then(|allowed| begin.checked_add(allowed));
-    let asked = interrupt.clone();
-    interrupt.among.store(job.world() > 1, Ordering::Relaxed);
-    interrupt.stepping.store(true, Ordering::Relaxed);
-    trainer.stop_when(move || asked.asked.load(Ordering::Relaxed) || over.is_some_and(|time| Instant::now() >= time));
+    interrupt.begin(job.world());
+    let (asked, at_once) = (interrupt.clone(), interrupt.clone());
+    trainer.stop_when(move || asked.is_asked() || over.is_some_and(|time| Instant::now() >= time));
+    trainer.interrupt_when(move || at_once.is_asked());
     // Rank 0 speaks and writes for all.
-    let journal = || Journal::open(output, trainer.step_count(), total).map_err(CliError::from);
-    let mut journal = job.together(if job.first() { journal().map(Some) } else { Ok(None) })?;
-    while trainer.step_count() < total {
-        let report = match trainer.step() {
-            Ok(report) => report,
-            // The others cannot be heard any more.
-            Err(e @ FlowError::Ranks { .. }) => return Err(e.into()),
-            Err(e) => {
-                // What was learned before is not lost; if it cannot be saved either, the first error is the one to tell.
-                let synced = journal.as_mut().map_or(Ok(()), Journal::sync);
-                let saved = trainer.save();
-                let saved = synced.and(saved);
-                say(&saved.map_or_else(|e| e.to_string(), |_| format!("saved step {}", trainer.step_count())));
-                return job.together(Err(e.into()));
-            }
-        };
-        interrupt.heard.store(report.stop, Ordering::Relaxed);
-        if let Some(journal) = &mut journal {
-            journal.step(&report)?;
-        }
-        if let Some(validated) = trainer.validate()?
-            && let Some(journal) = &mut journal
-        {
-            journal.validated(&validated)?;
-        }
-        if report.step % args.save_every == 0 || report.step == total || report.stop {
-            journal.as_mut().map_or(Ok(()), Journal::sync)?;
-            trainer.save()?;
-        }
-        if report.stop {
-            break;
-        }
+    let journal = || Journal::open(output, &trainer).map_err(CliError::from);
+    let journal = job.together(if job.first() { journal().map(Some) } else { Ok(None) })?;
+    let mut run = Run::new(&mut trainer, journal, interrupt, args.save_every);
+    match run.go_on() {
+        // The others cannot be heard any more.
+        Err(e @ FlowError::Ranks { .. }) => return Err(e.into()),
+        ended => job.together(ended.map_err(CliError::from))?,
     }
-    if let Some(Journal { bar, .. }) = journal {
-        bar.finish();
+    run.finish();
+    if job.first() {
         println!("{} of {total} steps; {}", trainer.step_count(), output.join("checkpoint.safetensors").display());
     }
     // A launcher would take it for a failure, and end the others while rank 0 may still be writing.
-    if interrupt.asked.load(Ordering::Relaxed) && trainer.step_count() < total && job.world() == 1 {
+    if interrupt.is_asked() && !trainer.is_finished() && job.world() == 1 {
         return Err(CliError::asked_to_end("the same command goes on from here"));
     }
     Ok(())
-}
-
-/// Among several ranks: for so long the step may take after which a run is to end. One that waits for a rank which is gone
-/// waits for ever, and launchers that end the others ask first.
-const PATIENCE: Duration = Duration::from_secs(8);
-
-/// What the user, or the system, wants of a run.
-#[derive(Default)]
-struct Interrupt {
-    asked: AtomicBool,    // to end
-    stepping: AtomicBool, // there is something to save
-    among: AtomicBool,    // several ranks
-    heard: AtomicBool,    // by the run itself
-}
-
-impl Interrupt {
-    /// At the first signal. Before there is anything to save, that ends the process.
-    fn ask(self: Arc<Self>) {
-        let end = || std::process::exit(EXIT_CODE.into());
-        if !self.stepping.load(Ordering::Relaxed) {
-            end();
-        }
-        self.asked.store(true, Ordering::Relaxed);
-        eprintln!("asked to end: saving after this step; once more ends at once");
-        if self.among.load(Ordering::Relaxed) {
-            std::thread::spawn(move || {
-                std::thread::sleep(PATIENCE);
-                if !self.heard.load(Ordering::Relaxed) {
-                    eprintln!("the other ranks do not answer");
-                    end();
-                }
-            });
-        }
-    }
-}
-
-/// What a run tells: on the terminal, in log.jsonl, to TensorBoard.
-struct Journal {
-    log: Log,
-    events: Events,
-    bar: Progress,
-}
-
-impl Journal {
-    /// That of a run in `folder` which is at `step` of `total`.
-    fn open(folder: &Path, step: u64, total: u64) -> Result<Self, FlowError> {
-        let log = Log::open(&folder.join("log.jsonl"), step)?;
-        Ok(Self { log, events: Events::open(folder, step)?, bar: Progress::new("training", total) })
-    }
-
-    fn step(&mut self, report: &StepReport) -> Result<(), FlowError> {
-        self.log.add(report)?;
-        self.events.scalars(report.step, "train", report)?;
-        self.bar.at(report.step, &line(report));
-        Ok(())
-    }
-
-    fn validated(&mut self, validated: &Validated) -> Result<(), FlowError> {
-        self.log.add(validated)?;
-        let Validated { step, validation: v, best, .. } = validated;
-        self.events.scalars(*step, "validation", v)?;
-        for (i, picture) in v.pictures.iter().enumerate() {
-            self.events.picture(*step, &format!("validation/sample {i}"), picture)?;
-        }
-        eprintln!(
-            "validation after {step} steps: flow {:.3} held {:.4} PSNR {:.2} dB of {} samples (best {:.2} dB after {} steps)",
-            v.flow, v.held, v.psnr, v.samples, best.psnr, best.step
-        );
-        Ok(())
-    }
-
-    fn sync(&mut self) -> Result<(), FlowError> {
-        self.log.sync()?;
-        self.events.sync()
-    }
 }
 
 /// What has to be the same on all ranks, besides what the trainer compares itself.
@@ -294,19 +193,4 @@ fn dry_run(config: &TrainConfig, device: &Device) -> Result<(), CliError> {
         println!("{}", ModelInfo::with_execution(&model, workload, execution));
     }
     Ok(())
-}
-
-/// What the progress says of a step.
-fn line(report: &StepReport) -> String {
-    let StepReport { loss, flow, held, seconds, .. } = report;
-    let mut line = format!("loss {loss:.3} flow {flow:.3} held {held:.4} {seconds:.2} s");
-    for (count, what) in [(report.skipped, "steps not finite"), (report.broken, "objects unreadable")] {
-        if count > 0 {
-            line += &format!(", {count} {what}");
-        }
-    }
-    if let Some((rank, waited)) = report.slowest() {
-        line += &format!(", rank {rank} slowest, the others waited {waited:.2} s");
-    }
-    line
 }

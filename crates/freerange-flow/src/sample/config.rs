@@ -7,10 +7,14 @@ use freerange_model::{Compute, ModelKind};
 use super::{Background, sampler::PhotometricStep, solver::Solver};
 use crate::{FlowError, coupling::Coupling};
 
+/// Number of the meaning of settings in records: of [`SampleConfig`], of fits and of refinement. Raise it whenever the same
+/// recorded settings come to mean another computation, or a default changes: results of different numbers are never mixed.
+pub const SETTINGS_SCHEMA: u32 = 1;
+
 /// Far above what has been measured (three), so that nobody waits for hours by a slip.
 const MOST_DETAIL: usize = 16;
 
-/// How to sample.
+/// How to sample. Records hold every field, whatever its default is.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SampleConfig {
@@ -20,14 +24,11 @@ pub struct SampleConfig {
     pub solver: Solver,
     /// Steps of [`Solver::Hold`] after which the estimate's Gaussians are put in the order of a tree of their own, with its
     /// names of their axes, as those of a fit are: they have moved since. 0: never. On a GPU this waits for the steps before.
-    #[serde(skip_serializing_if = "is_zero")]
     pub regroup: usize,
     /// Make `2^depth` Gaussians; left out: as many as at the depth the model was trained at. Tokens carry no position,
     /// so that any number can be drawn, but sizes are those of the trained depth.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub depth: Option<u32>,
     /// Start from a quick fit of the input views instead of pure noise.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub start: Option<StartConfig>,
     /// Classifier-free guidance scale s: `z_u + s (z_c - z_u)`. 1 switches it off (and halves the work).
     #[serde(alias = "guidance")]
@@ -41,7 +42,6 @@ pub struct SampleConfig {
     /// Photometric steps per step of the solver, each at the estimate that the one before has moved. The paper takes one.
     pub photometric_repeats: usize,
     /// Side, in pixels, of the renders that photometric guidance compares with the images; left out: `gradient_size`.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub photometric_size: Option<u32>,
     /// Where the gradient that the network sees as input is taken.
     pub gradient_at: GradientAt,
@@ -56,33 +56,26 @@ pub struct SampleConfig {
     /// Most that photos may [doubt](freerange_fit::FoundMirror::doubt) the object's plane of symmetry for photos mirrored about it
     /// to be further input views of everything that follows. 0: none are looked for.
     /// [`reconstruct`](super::reconstruct) itself takes what it is given.
-    #[serde(skip_serializing_if = "is_nothing")]
     pub mirror: f32,
     /// Most that photos may [contradict](freerange_fit::FoundAxis::contradiction) an axis about which the object keeps its outlines for turned
     /// outlines to be more of what every fit agrees with. 0: none is looked for. [`reconstruct`](super::reconstruct) itself knows of none.
-    #[serde(skip_serializing_if = "is_nothing")]
     pub turn: f32,
     /// Steps of 3DGS-MCMC on up to four input views that follow ([`freerange_fit::refine`]), of more views more
     /// ([`for_photos`](freerange_fit::RefineConfig::for_photos)); [`reconstruct`](super::reconstruct) itself takes none.
     pub refine: usize,
     /// How fine the detail is that refinement looks for: so many times 256 pixels and 8,192 Gaussians, and less of a hold, as far as
     /// photos have these pixels ([`detailed`](freerange_fit::RefineConfig::detailed)).
-    #[serde(skip_serializing_if = "is_usual")]
     pub detail: usize,
     /// How many samples refinement begins with and is held at the mean pictures of, each from a fit and noise of its own.
     /// [`reconstruct`](super::reconstruct) itself draws what it is asked for.
-    #[serde(skip_serializing_if = "is_one")]
     pub ensemble: usize,
     /// Steps of a [fit](freerange_fit::polish) of the input views, at the size that quick fits have, that follow a sample from pure noise before it is
     /// [mended](Self::mend). [`reconstruct`](super::reconstruct) itself takes none.
-    #[serde(skip_serializing_if = "is_zero")]
     pub polish: usize,
     /// Steps of [`Solver::Hold`] that follow a sample from pure noise, with it in the place of a fit.
     /// [`reconstruct`](super::reconstruct) itself takes none.
-    #[serde(skip_serializing_if = "is_zero")]
     pub mend: usize,
     /// What is different where a model that starts from fits by itself is asked to start from pure noise; left out: nothing.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub from_noise: Option<FromNoise>,
 }
 
@@ -101,11 +94,11 @@ pub struct FromNoise {
     #[serde(default = "FromNoise::polish")]
     pub polish: usize,
     /// [`SampleConfig::mend`]
-    #[serde(default, skip_serializing_if = "is_zero")]
+    #[serde(default)]
     pub mend: usize,
     /// [`SampleConfig::background`]; left out: random colours. Fifty guided steps in front of white alone lose
     /// 2.5 dB (docs/experiments.md).
-    #[serde(default, skip_serializing_if = "is_random")]
+    #[serde(default)]
     pub background: Background,
 }
 
@@ -136,36 +129,13 @@ impl Default for SampleConfig {
             mirror: 0.0,
             turn: 0.0,
             refine: 0,
-            detail: DETAIL,
+            detail: 2,
             ensemble: 1,
             polish: 0,
             mend: 0,
             from_noise: None,
         }
     }
-}
-
-fn is_random(background: &Background) -> bool {
-    *background == Background::Random
-}
-
-fn is_zero(x: &usize) -> bool {
-    *x == 0
-}
-
-fn is_nothing(x: &f32) -> bool {
-    *x == 0.0
-}
-
-/// What [`SampleConfig::detail`] is where nothing says otherwise.
-const DETAIL: usize = 2;
-
-fn is_usual(detail: &usize) -> bool {
-    *detail == DETAIL
-}
-
-fn is_one(x: &usize) -> bool {
-    *x == 1
 }
 
 impl SampleConfig {
@@ -319,6 +289,23 @@ pub enum GradientAt {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// A record of [`SETTINGS_SCHEMA`] 1 that lacks a field means these. A default that changes needs another number, and
+    /// its old value where records of this one are read (`freerange::sampling`).
+    #[test]
+    fn defaults_are_those_of_their_schema() {
+        assert_eq!(SETTINGS_SCHEMA, 1);
+        let found = serde_json::to_value(SampleConfig::default()).unwrap();
+        let defaults = serde_json::json!({
+            "steps": 50, "solver": "euler", "regroup": 0, "depth": null, "start": null, "cfg_scale": 2.0, "lambda_pg": 50.0,
+            "photometric_step": "gradient", "photometric_repeats": 1, "photometric_size": null, "gradient_at": "noisy",
+            "gradient_size": 512, "background": "random", "coupling": "independent", "compute": "f32", "mirror": 0.0,
+            "turn": 0.0, "refine": 0, "detail": 2, "ensemble": 1, "polish": 0, "mend": 0, "from_noise": null
+        });
+        for (name, default) in defaults.as_object().unwrap() {
+            assert_eq!(&found[name], default, "{name}");
+        }
+    }
 
     #[test]
     fn old_names_are_read_and_new_ones_written() {

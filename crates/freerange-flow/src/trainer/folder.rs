@@ -1,17 +1,38 @@
 //! A run's folder belongs to one run.
 
-use std::path::{Path, PathBuf};
+use std::{
+    fs::{File, TryLockError},
+    io::Write,
+    path::{Path, PathBuf},
+};
 
-use freerange_core::IoError;
+use freerange_core::{IoError, write_atomically};
 use freerange_data::Making;
 use freerange_model::EncoderConfig;
 
 use crate::{FlowError, config::TrainConfig, inherit::is_path};
 
-/// Makes the folder of a run, or refuses that of another one.
-pub(super) fn claim<M: Making>(config: &TrainConfig<M>, folder: &Path) -> Result<(), FlowError> {
+/// Makes the folder of a run, or refuses that of another one, or one in which another process trains. The folder is this
+/// process's until the lock is dropped.
+pub(super) fn claim<M: Making>(config: &TrainConfig<M>, folder: &Path) -> Result<File, FlowError> {
     std::fs::create_dir_all(folder).map_err(IoError::at(folder))?;
-    check_same_run(config, folder)
+    let lock = lock(folder)?;
+    check_same_run(config, folder)?;
+    Ok(lock)
+}
+
+/// Two processes would remove each other's states.
+fn lock(folder: &Path) -> Result<File, FlowError> {
+    let path = folder.join(".lock");
+    let file = File::create(&path).map_err(IoError::at(&path))?;
+    match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(TryLockError::WouldBlock) => {
+            let problem = "expected a folder of its own for each run, found that another process trains in it".into();
+            Err(FlowError::State { path: folder.into(), problem })
+        }
+        Err(TryLockError::Error(source)) => Err(IoError { path, source }.into()),
+    }
 }
 
 /// A run's folder holds its configuration: going on with another one would mix two runs.
@@ -56,7 +77,7 @@ fn check_same_run<M: Making>(config: &TrainConfig<M>, folder: &Path) -> Result<(
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => {}
         Err(e) => return Err(IoError::at(&path)(e).into()),
     }
-    Ok(std::fs::write(&path, text).map_err(IoError::at(&path))?)
+    Ok(write_atomically(&path, |file| file.write_all(text.as_bytes())).map_err(IoError::at(&path))?)
 }
 
 /// The path of a folder otherwise said by `say`; URLs and the like, and what cannot be said, as they are.

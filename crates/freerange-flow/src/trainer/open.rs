@@ -114,9 +114,12 @@ impl Trainer {
         let plain = device.clone().inner();
         let prepared = agree(ranks, Prepared::new(&config, initial, encoder, share, &plain, &mut progress))?;
         prepared.require_same_on_all(&among, &config)?;
+        if let Some(validation) = &prepared.validation {
+            validation.require_comparisons(ranks, &config)?;
+        }
         let compute = compute_of_first(ranks, config.optimizer.compute, &plain)?;
         // Not before the data are there: a folder that holds a configuration belongs to a run.
-        agree(ranks, if share[0] == 0 { claim(&config, folder) } else { Ok(()) })?;
+        let lock = agree(ranks, if share[0] == 0 { claim(&config, folder).map(Some) } else { Ok(None) })?;
         let described = serde_json::to_value(&config).expect("a configuration is plain");
         let (config, _) = config.apart();
         let (model, frozen) = agree(ranks, prepared.model(&config, compute, &plain))?;
@@ -156,10 +159,12 @@ impl Trainer {
             ranks: among.ranks,
             lanes,
             stop_when: Box::new(|| false),
+            interrupt_when: Box::new(|| false),
             ahead: None,
             not_finite: 0,
             validation,
             folder: folder.into(),
+            _lock: lock,
         })
     }
 }

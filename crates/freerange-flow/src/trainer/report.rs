@@ -57,8 +57,8 @@ pub struct Validated {
     pub seen_samples: u64,
     /// What was measured.
     pub validation: Figures,
-    /// The best measurement so far, this one included, which `best.safetensors` is of.
-    pub best: Best,
+    /// The best measurement so far, this one included, which `best.safetensors` is of; none where no PSNR was a number.
+    pub best: Option<Best>,
 }
 
 /// The best measurement of a run.
@@ -68,4 +68,11 @@ pub struct Best {
     pub step: u64,
     /// [`Figures::psnr`].
     pub psnr: f64,
+}
+
+impl Best {
+    /// Whether it takes the place of the best one before. What is not finite never does.
+    pub(super) fn is_better_than(self, before: Option<Self>) -> bool {
+        self.psnr.is_finite() && before.is_none_or(|before| self.psnr > before.psnr)
+    }
 }

@@ -12,7 +12,7 @@ use crate::{
     FlowError,
     config::DataConfig,
     optimizer::AdamW,
-    ranks::{Ranks, from_first, same_on_all, tensor_of_first},
+    ranks::{Ranks, agree, from_first, same_on_all, tensor_of_first},
     weights::Weights,
 };
 
@@ -41,6 +41,9 @@ pub(super) struct Progress {
     /// The best measurement so far.
     #[serde(default)]
     pub(super) best: Option<Best>,
+    /// The step that the last measurement was made after; 0: none was. Left out where measurements came before every state.
+    #[serde(default)]
+    pub(super) measured: Option<u64>,
     /// The frozen encoder's weights; none of an encoder of its own, or of random ones.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(super) encoder: Option<WeightsOrigin>,
@@ -93,8 +96,9 @@ impl State {
         let optimizer = AdamW::load(&state("optimizer.safetensors"), &average, device)?;
         let file = state("progress.json");
         let text = std::fs::read_to_string(&file).map_err(IoError::at(&file))?;
-        let progress = serde_json::from_str::<Progress>(&text)
+        let mut progress = serde_json::from_str::<Progress>(&text)
             .map_err(|e| FlowError::State { path: file.clone(), problem: e.to_string() })?;
+        progress.measured.get_or_insert(progress.step);
         let run = || format!("the run, in {}", file.display());
         require_same_encoder(progress.encoder.as_ref(), origin, run)?;
         Ok(Self { model, average, optimizer, progress })
@@ -150,6 +154,7 @@ impl State {
             broken: 0,
             skipped: 0,
             best: None,
+            measured: Some(0),
             encoder,
         };
         let average = Weights::of(&model);
@@ -162,15 +167,21 @@ impl Trainer {
     /// Saves everything that [`Trainer::open`] needs to go on, and the checkpoint of the averaged weights beside it.
     ///
     /// The state is written into a folder of its own and becomes the latest one by a rename; then older ones go. Rank 0 does
-    /// it, but all ranks must call it: their weights are compared before.
+    /// it, but all ranks must call it: their weights are compared before, and where it fails, it does on all of them.
     ///
     /// # Errors
-    /// [`FlowError::Io`], [`FlowError::State`]; [`FlowError::Ranks`] where the ranks' weights have come apart.
+    /// [`FlowError::Io`], [`FlowError::State`]; [`FlowError::Elsewhere`]; [`FlowError::Ranks`] where the ranks' weights have
+    /// come apart.
     pub fn save(&self) -> Result<PathBuf, FlowError> {
         self.compare_weights()?;
-        if self.ranks.rank() > 0 {
-            return Ok(self.folder.join("checkpoint.safetensors"));
-        }
+        let path = self.folder.join("checkpoint.safetensors");
+        let written = if self.ranks.rank() == 0 { self.write(&path) } else { Ok(()) };
+        agree(&*self.ranks, written)?;
+        Ok(path)
+    }
+
+    /// Writes the state, and the checkpoint to `path`.
+    fn write(&self, path: &Path) -> Result<(), FlowError> {
         let target = self.folder.join(format!("state-{:09}", self.progress.step));
         let partial = self.folder.join("state.partial");
         if partial.exists() {
@@ -199,9 +210,7 @@ impl Trainer {
                 std::fs::remove_dir_all(&old).map_err(IoError::at(&old))?;
             }
         }
-        let path = self.folder.join("checkpoint.safetensors");
-        self.checkpoint(average)?.save(&path)?;
-        Ok(path)
+        Ok(self.checkpoint(average)?.save(path)?)
     }
 
     /// Refuses ranks whose weights are not those of rank 0 to the bit.

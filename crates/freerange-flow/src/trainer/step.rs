@@ -49,6 +49,7 @@ impl Trainer {
     /// After an error, too, [`save`](Self::save) keeps what was reached before it. Where one rank cannot take it, none does.
     ///
     /// # Errors
+    /// [`FlowError::Cancelled`] of a single rank where [`interrupt_when`](Self::interrupt_when) said so;
     /// [`FlowError::NotFinite`], on all ranks; those of data and device; [`FlowError::Elsewhere`]; [`FlowError::Ranks`].
     pub fn step(&mut self) -> Result<StepReport, FlowError> {
         let begin = Instant::now();
@@ -115,6 +116,10 @@ impl Trainer {
         let mut sums: Option<(Flat, Tensor<1>)> = None;
         let mut positions = Vec::new();
         for (i, &part) in parts.iter().enumerate() {
+            // Others would wait for the sum: there, the step is finished.
+            if self.ranks.world() == 1 && (self.interrupt_when)() {
+                return Err(FlowError::Cancelled);
+            }
             let begin = Instant::now();
             let batch = match self.ahead.take() {
                 Some(batch) => batch?,

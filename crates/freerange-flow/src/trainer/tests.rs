@@ -92,6 +92,11 @@ fn open(config: &TrainConfig, folder: &Path, initial: Option<Initial>) -> Traine
     Trainer::open(config.clone(), folder, initial, &Device::flex(), |_| {}).unwrap()
 }
 
+/// Measures, if that is due; nobody asks to end meanwhile.
+fn validate(trainer: &mut Trainer) -> Option<Validated> {
+    trainer.validate().unwrap().continue_value().unwrap()
+}
+
 /// Makes the next batch one that no loss can be computed of.
 fn spoil(trainer: &mut Trainer) {
     let batch = trainer.ahead.as_mut().unwrap().as_mut().unwrap();
@@ -119,13 +124,14 @@ fn a_step_that_is_not_finite_changes_nothing_and_training_goes_on() {
     assert_eq!(serde_json::to_value(&report).unwrap()["loss"], serde_json::Value::Null);
     trainer.save().unwrap();
 
-    let mut again = open(&config(), folder.path(), None);
-    for trainer in [&mut trainer, &mut again] {
+    let third = |mut trainer: Trainer| {
         let report = trainer.step().unwrap();
         assert!(report.loss.is_finite() && report.step == 3 && report.skipped == 1, "{report:?}");
-    }
-    assert!(state(&trainer) != before);
-    assert!(state(&trainer) == state(&again));
+        state(&trainer)
+    };
+    let after = third(trainer);
+    assert!(after != before);
+    assert!(after == third(open(&config(), folder.path(), None)));
 }
 
 #[test]
@@ -141,6 +147,7 @@ fn a_model_that_always_fails_ends_with_its_state() {
     let error = trainer.step().unwrap_err();
     assert!(matches!(error, FlowError::NotFinite { steps: NOT_FINITE_IN_A_ROW, last: 6, .. }), "{error}");
     trainer.save().unwrap();
+    drop(trainer);
     let mut again = open(&config(), folder.path(), None);
     let report = again.step().unwrap();
     assert!(report.loss.is_finite() && report.step == 7 && report.skipped == 5, "{report:?}");
@@ -270,7 +277,7 @@ fn other_objects_are_measured_now_and_then_and_nothing_else_changes() {
         let (mut losses, mut found) = (Vec::new(), Vec::new());
         while trainer.step_count() < until {
             losses.push(trainer.step().unwrap().loss);
-            let validated = trainer.validate().unwrap();
+            let validated = validate(&mut trainer);
             assert_eq!(validated.is_some(), config.validation.every > 0 && trainer.step_count().is_multiple_of(2));
             found.extend(validated.map(|v| serde_json::to_value(&v).unwrap()));
         }
@@ -328,12 +335,15 @@ fn the_frozen_encoder_is_neither_averaged_nor_optimised_nor_saved() {
     assert_eq!(loaded.model.encoder().dinov2().unwrap().origin().unwrap().sha256, encoder.origin().unwrap().sha256);
     let image = Tensor::<4>::ones([1, 3, 28, 28], &Device::flex()).mul_scalar(0.3);
     let features = |e: &Dinov2, image: Tensor<4>| e.patch_features(image).into_data().try_to_vec::<f32>().unwrap();
-    let mut again = open();
+    let next = |mut trainer: Trainer| {
+        let report = trainer.step().unwrap();
+        (report.loss, report.gradient_norm, state(&trainer))
+    };
+    let expected = next(trainer);
+    let again = open();
     let frozen = again.frozen.clone().unwrap();
     assert_eq!(features(&frozen, image.clone()), features(&encoder, image));
-    let (a, b) = (trainer.step().unwrap(), again.step().unwrap());
-    assert_eq!((a.loss, a.gradient_norm), (b.loss, b.gradient_norm));
-    assert!(state(&trainer) == state(&again));
+    assert!(next(again) == expected);
 }
 
 /// The gradient of a step is the mean over its parts, each by its share of the objects.
@@ -429,7 +439,7 @@ fn told(world: usize, config: &TrainConfig, folder: &Path, until: u64) -> Vec<To
             assert_eq!(r.rank_seconds.len(), if world > 1 { world } else { 0 });
             steps.push([r.loss, r.flow, r.seen, r.held, r.gradient_norm]);
             // Pictures are of a rank's own objects.
-            figures.extend(trainer.validate().unwrap().map(|v| Figures { pictures: Vec::new(), ..v.validation }));
+            figures.extend(validate(&mut trainer).map(|v| Figures { pictures: Vec::new(), ..v.validation }));
         }
         trainer.save().unwrap();
         let checksums = [Weights::of(&trainer.model).checksum(), trainer.average.checksum()];
@@ -612,4 +622,173 @@ fn lanes_divide_batch_and_window() {
     assert_eq!(found[1], "data.fresh: expected a multiple of data.lanes, 4, found 2");
     assert_eq!(found[2], "stage.batch: expected a multiple of data.lanes, 4, found 6");
     assert_eq!(found[3], "data.lanes: expected 1 to 4096, found 0");
+}
+
+/// A run whose model starts from fits, on objects that have none.
+fn from_fits() -> TrainConfig {
+    let mut config = config();
+    config.validation = crate::ValidationConfig { every: 1, objects: 1 };
+    let start = crate::sample::StartConfig::default();
+    config.sample = SampleConfig { start: Some(start), cfg_scale: 1.0, gradient_size: 16, ..SampleConfig::default() };
+    config
+}
+
+#[test]
+fn a_run_that_could_never_compare_a_sample_is_refused() {
+    let place = tempfile::tempdir().unwrap();
+    let refused = |config: TrainConfig| {
+        let run = place.path().join("run");
+        let error = Trainer::open(config, &run, None, &Device::flex(), |_| {}).err().expect("refused");
+        assert!(!run.exists());
+        error.to_string()
+    };
+    let text = refused(from_fits());
+    assert!(text.contains("validation.objects") && text.contains("sample.start"), "{text}");
+    let mut config = config();
+    config.validation = crate::ValidationConfig { every: 1, objects: 1 };
+    config.loss.input_views = (4, 4);
+    let text = refused(config);
+    assert!(text.contains("validation.objects") && text.contains("views"), "{text}");
+}
+
+#[test]
+fn a_measurement_that_is_no_number_is_never_the_best() {
+    let of = |psnr: f64| Best { step: 7, psnr };
+    for lost in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
+        assert!(!of(lost).is_better_than(None) && !of(lost).is_better_than(Some(of(3.0))));
+    }
+    assert!(of(3.0).is_better_than(None) && of(3.5).is_better_than(Some(of(3.0))));
+    assert!(!of(3.0).is_better_than(Some(of(3.0))), "the first of equals");
+}
+
+/// A run that measures after every second step.
+fn measuring() -> TrainConfig {
+    let mut config = config();
+    config.validation = crate::ValidationConfig { every: 2, objects: 2 };
+    config.sample = SampleConfig { steps: 1, cfg_scale: 1.0, gradient_size: 16, ..SampleConfig::default() };
+    config
+}
+
+#[test]
+fn a_measurement_that_is_due_is_made_when_the_run_goes_on() {
+    let place = tempfile::tempdir().unwrap();
+    let folder = |name: &str| place.path().join(name);
+    let two = |name: &str| {
+        let mut trainer = open(&measuring(), &folder(name), None);
+        (0..2).for_each(|_| drop(trainer.step().unwrap()));
+        trainer
+    };
+    let told = |trainer: &mut Trainer| serde_json::to_value(validate(trainer).unwrap()).unwrap();
+    let mut whole = two("whole");
+    let expected = told(&mut whole);
+    assert!(validate(&mut whole).is_none() && whole.measured() == 2);
+    whole.save().unwrap();
+    // One that was made is not made again.
+    drop(whole);
+    assert!(validate(&mut open(&measuring(), &folder("whole"), None)).is_none());
+
+    // Saved at once after the step, or given up in the middle: by the first object, and by the first step of sampling.
+    let saved = two("saved");
+    saved.save().unwrap();
+    drop(saved);
+    assert!(!folder("saved").join("best.safetensors").exists());
+    for asked in 0..4 {
+        let mut trainer = open(&measuring(), &folder("saved"), None);
+        let times = std::cell::Cell::new(0);
+        trainer.interrupt_when(move || times.replace(times.get() + 1) == asked);
+        assert!(trainer.validate().unwrap().is_break() && trainer.progress.best.is_none());
+        trainer.save().unwrap();
+    }
+    let mut again = open(&measuring(), &folder("saved"), None);
+    assert!(!again.is_finished() && again.measured() == 0);
+    assert_eq!(told(&mut again), expected);
+    let best = |name: &str| std::fs::read(folder(name).join("best.safetensors")).unwrap();
+    // The header has the time that training took.
+    let weights = |bytes: Vec<u8>| bytes[8 + u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize..].to_vec();
+    assert!(weights(best("saved")) == weights(best("whole")));
+}
+
+#[test]
+fn a_state_of_before_measurements_were_recorded_has_been_measured() {
+    let place = tempfile::tempdir().unwrap();
+    let mut trainer = open(&measuring(), place.path(), None);
+    (0..2).for_each(|_| drop(trainer.step().unwrap()));
+    trainer.save().unwrap();
+    drop(trainer);
+    let file = place.path().join("state-000000002/progress.json");
+    let mut progress: serde_json::Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+    progress.as_object_mut().unwrap().remove("measured").unwrap();
+    std::fs::write(&file, progress.to_string()).unwrap();
+    assert!(validate(&mut open(&measuring(), place.path(), None)).is_none());
+}
+
+#[test]
+fn a_step_in_parts_can_be_given_up() {
+    let place = tempfile::tempdir().unwrap();
+    let mut config = config();
+    config.stages[0] = Stage { batch: 3, micro_batch: Some(1), ..config.stages[0].clone() };
+    let three = |name: &str, part: Option<u32>| {
+        let folder = place.path().join(name);
+        let mut trainer = open(&config, &folder, None);
+        trainer.step().unwrap();
+        if let Some(part) = part {
+            let times = std::cell::Cell::new(0);
+            trainer.interrupt_when(move || times.replace(times.get() + 1) == part);
+            assert!(matches!(trainer.step(), Err(FlowError::Cancelled)));
+            assert_eq!(trainer.step_count(), 1);
+            trainer.save().unwrap();
+            drop(trainer);
+            trainer = open(&config, &folder, None);
+        }
+        (0..2).for_each(|_| drop(trainer.step().unwrap()));
+        state(&trainer)
+    };
+    let expected = three("whole", None);
+    for part in 0..3 {
+        assert!(three(&format!("given up at {part}"), Some(part)) == expected, "part {part}");
+    }
+}
+
+#[test]
+fn all_ranks_give_a_measurement_up_where_one_is_asked_to_end() {
+    let place = tempfile::tempdir().unwrap();
+    let mut config = in_lanes();
+    config.validation.every = 1;
+    among(2, |ranks| {
+        let mut trainer = open_among(ranks.clone(), &config, &place.path().join("run")).unwrap();
+        trainer.step().unwrap();
+        if ranks.rank() == 1 {
+            trainer.interrupt_when(|| true);
+        }
+        assert!(trainer.validate().unwrap().is_break() && trainer.measured() == 0);
+        trainer.interrupt_when(|| false);
+        assert_eq!(validate(&mut trainer).unwrap().step, 1);
+        // What only rank 0 writes fails on all of them.
+        trainer.step().unwrap();
+        if ranks.rank() == 0 {
+            std::fs::remove_file(place.path().join("run/best.safetensors")).unwrap();
+            std::fs::create_dir(place.path().join("run/best.safetensors")).unwrap();
+        }
+        trainer.progress.best = None;
+        trainer.validate().unwrap_err();
+        trainer.save().unwrap();
+        if ranks.rank() == 0 {
+            std::fs::remove_file(place.path().join("run/checkpoint.safetensors")).unwrap();
+            std::fs::create_dir(place.path().join("run/checkpoint.safetensors")).unwrap();
+        }
+        trainer.save().unwrap_err();
+    });
+}
+
+#[test]
+fn a_folder_is_one_process_s() {
+    let place = tempfile::tempdir().unwrap();
+    let open = || Trainer::open(config(), place.path(), None, &Device::flex(), |_| {});
+    let first = open().unwrap();
+    let text = open().err().expect("refused").to_string();
+    let folder = place.path().display().to_string();
+    assert!(text.contains(&folder) && text.contains("another process"), "{text}");
+    first.save().unwrap();
+    drop(first);
+    assert_eq!(open().unwrap().step_count(), 0);
 }

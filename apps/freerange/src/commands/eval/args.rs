@@ -2,7 +2,7 @@
 
 use std::{path::PathBuf, sync::Arc};
 
-use freerange::{Device, checkpoint_sha256, machine};
+use freerange::{Device, SETTINGS_SCHEMA, checkpoint_sha256, machine};
 use freerange_core::Share;
 use freerange_eval::{
     Environment, Scorer, ScorerConfig,
@@ -208,7 +208,7 @@ impl RunArgs {
     /// What the numbers of a run depend on.
     pub fn settings(&self, method: &Method, inputs: &[usize], shared: &Shared, source: &Value) -> Value {
         json!({
-            "source": source, "method": method.settings(), "views": self.views.sets(),
+            "settings_schema": SETTINGS_SCHEMA, "source": source, "method": method.settings(), "views": self.views.sets(),
             "inputs": inputs, "metrics": shared.scorer.metrics(), "weights": shared.scorer.used_files(),
         })
     }

@@ -7,7 +7,7 @@ use std::{
     time::{Instant, UNIX_EPOCH},
 };
 
-use freerange::{Reconstructor, Scores, checkpoint_sha256};
+use freerange::{Reconstructor, SETTINGS_SCHEMA, Scores, checkpoint_sha256};
 use freerange_core::write_atomically;
 use freerange_flow::ranks::gather;
 use serde::{Deserialize, Serialize};
@@ -247,7 +247,8 @@ fn options(args: &Args, model: &Reconstructor) -> Result<BTreeMap<String, String
     let mut formats: Vec<String> = args.format.iter().map(ToString::to_string).collect();
     formats.sort();
     let mut told = BTreeMap::from([
-        ("checkpoint".to_owned(), checkpoint),
+        ("settings_schema".to_owned(), SETTINGS_SCHEMA.to_string()),
+        ("checkpoint".into(), checkpoint),
         ("seeds".into(), format!("{:?}", sampling.seeds)),
         ("views".into(), format!("{:?}", args.views)),
         ("up".into(), format!("{:?}", args.sampling.up)),
