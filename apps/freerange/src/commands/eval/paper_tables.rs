@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use freerange_core::{IoError, write_atomically};
+use freerange_core::write_atomically;
 use freerange_eval::paper_tables::PaperTables;
 
 use crate::error::CliError;
@@ -33,7 +33,8 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         None => print!("{}", text.trim_start()),
         Some(path) => {
             let text = text.trim_start().as_bytes();
-            write_atomically(path, |file| std::io::Write::write_all(file, text)).map_err(IoError::at(path))?;
+            write_atomically(path, |file| std::io::Write::write_all(file, text))
+                .map_err(|e| CliError::file(path, e))?;
         }
     }
     Ok(())
