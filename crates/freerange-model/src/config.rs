@@ -10,6 +10,8 @@ pub const CHANNELS: usize = freerange_splat::channel::COUNT;
 pub const PLUCKER: usize = 6;
 /// Channels of a pixel-aligned Gaussian before decoding: distance, scales, rotation, opacity, color.
 pub(crate) const PIXEL_CHANNELS: usize = 1 + 3 + 4 + 1 + 3;
+/// Largest side of the images whose pixels become Gaussians: a million of each.
+const MOST_PIXEL_ALIGNED: usize = 1024;
 /// Most Gaussians of one object that a volume may have.
 const MOST_GAUSSIANS: usize = 1 << 24;
 /// Channels per Gaussian of what the input views show of it.
@@ -480,6 +482,9 @@ impl ModelConfig {
             within("volume.cells_per_token_side", cells_per_token_side, 1, 8)?;
             within("volume.gaussians_per_cell", gaussians_per_cell, 1, 64)?;
             within("volume (Gaussians of all its cells)", self.gaussians(0, 0), 1, MOST_GAUSSIANS)?;
+        }
+        if self.kind == ModelKind::PixelAligned {
+            within("image_size", self.image_size as usize, 1, MOST_PIXEL_ALIGNED)?;
         }
         if self.kind.one_pass() {
             only("gradient_channels", self.gradient_channels, false)?;

@@ -204,6 +204,7 @@ fn parts_of_other_kinds_are_refused_by_name() {
         ("volume", ModelConfig { volume: None, ..config(ModelKind::VoxelAligned) }),
         ("volume (Gaussians of all its cells)", ModelConfig { volume: large, ..config(ModelKind::VoxelAligned) }),
         ("gradient_channels", ModelConfig { gradient_channels: true, ..config(ModelKind::PixelAligned) }),
+        ("image_size", ModelConfig { image_size: 2048, ..config(ModelKind::PixelAligned) }),
         ("volume", ModelConfig { volume, ..ModelConfig::default() }),
     ];
     for (field, config) in cases {

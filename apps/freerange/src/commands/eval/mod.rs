@@ -4,6 +4,7 @@ mod ablations;
 mod args;
 mod compare;
 mod methods;
+mod paper_pictures;
 mod paper_tables;
 mod sources;
 
@@ -41,7 +42,7 @@ enum Command {
     /// Measure what each setting of sampling is worth, on one checkpoint and one source of objects.
     Ablations(Box<ablations::Args>),
     /// Write the paper's four tables, its numbers beside those of rows that were trained and evaluated here.
-    PaperTables(paper_tables::Args),
+    PaperTables(Box<paper_tables::Args>),
 }
 
 pub fn run(args: &Args) -> Result<(), CliError> {

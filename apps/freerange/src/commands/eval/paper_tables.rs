@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use freerange_core::write_atomically;
 use freerange_eval::paper_tables::PaperTables;
 
+use super::paper_pictures::PictureArgs;
 use crate::error::CliError;
 
 /// Arguments of `eval paper-tables`.
@@ -21,6 +22,8 @@ pub struct Args {
     /// Seed of the bootstrap.
     #[arg(long, default_value_t = 0)]
     seed: u64,
+    #[command(flatten)]
+    pictures: PictureArgs,
 }
 
 pub fn run(args: &Args) -> Result<(), CliError> {
@@ -28,6 +31,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     if let Some(place) = &args.keep {
         tables.keep(place)?;
     }
+    args.pictures.run()?;
     let text = tables.markdown();
     match &args.output {
         None => print!("{}", text.trim_start()),

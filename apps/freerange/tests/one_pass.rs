@@ -1,0 +1,90 @@
+//! Models that predict in one pass are trained, asked and measured by the same commands as the flow's.
+
+use std::{
+    path::{Path, PathBuf},
+    process::{Command, Output},
+};
+
+const CONFIG: &str = r#"
+seed = 5
+model = { kind = "pixel_aligned", gradient_channels = false, image_size = 16, hidden = 16, blocks = 1, heads = 2, registers = 2, encoder = { kind = "patch", patch_size = 8, channels = 4 } }
+loss = { flow = false, unconditional = 0.0, held_views = 1, input_views = [2, 2], render_size = 16 }
+stage = [{ depth = 3, image_size = 16, batch = 2, steps = 2 }]
+sample = { steps = 1, cfg_scale = 1.0, lambda_pg = 0.0 }
+
+[data]
+window = 2
+fresh = 0
+workers = 1
+statistics_objects = 1
+
+[data.object]
+views = 4
+samples_per_axis = 1
+
+[data.object.cameras]
+resolution = 16
+
+[data.object.surface]
+points = 64
+"#;
+
+fn freerange(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_freerange")).args(args).output().unwrap()
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+#[test]
+fn a_pixel_aligned_model_goes_through_every_command() {
+    let place = tempfile::tempdir().unwrap();
+    let path = |name: &str| -> PathBuf { place.path().join(name) };
+    std::fs::write(path("model.toml"), CONFIG).unwrap();
+    let (config, run) = (path("model.toml"), path("run"));
+    let dry = freerange(&["train", text(&config), "--dry-run"]);
+    let said = String::from_utf8_lossy(&dry.stdout).into_owned();
+    assert!(dry.status.success() && said.contains("512 Gaussians: 10 tokens each"), "{said}"); // two views of 16 x 16
+    assert!(freerange(&["train", text(&config), "-o", text(&run)]).status.success());
+    let checkpoint = run.join("checkpoint.safetensors");
+
+    let info = freerange(&["model", "info", text(&checkpoint), "--json"]);
+    let info: serde_json::Value = serde_json::from_slice(&info.stdout).unwrap();
+    assert_eq!((&info["kind"], &info["samples"]), (&"pixel_aligned".into(), &4.0.into()));
+
+    let scene = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/bowl");
+    let out = path("out");
+    let reconstruct = ["reconstruct", scene, "--checkpoint", text(&checkpoint), "--device", "cpu", "-o", text(&out)];
+    let with = |more: &[&str]| freerange(&[&reconstruct[..], more].concat());
+    for (option, field) in [
+        (["--steps", "20"], "sample.steps"),
+        (["--cfg-scale", "2"], "sample.cfg_scale"),
+        (["--lambda-pg", "1"], "sample.lambda_pg"),
+        (["--start", "fit"], "sample.start"),
+        (["--depth", "8"], "sample.depth"),
+        (["--ensemble", "2"], "sample.ensemble"),
+        (["--samples", "2"], "seeds"),
+    ] {
+        let refused = with(&option);
+        let error = String::from_utf8_lossy(&refused.stderr).into_owned();
+        assert_eq!(refused.status.code(), Some(2), "{option:?}: {error}");
+        assert!(error.contains(field) && error.contains("pixel_aligned"), "{option:?}: {error}");
+        assert!(!out.exists());
+    }
+    let made = with(&["--refine", "3"]);
+    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    let report: serde_json::Value = serde_json::from_slice(&std::fs::read(out.join("report.json")).unwrap()).unwrap();
+    assert!(report["gaussians"].as_u64().unwrap() >= 2 * 16 * 16, "two views, one Gaussian per pixel: {report}");
+
+    let evaluation = path("rows/full/bowl");
+    let eval = ["eval", "--generated", "1", "--checkpoint", text(&checkpoint), "--device", "cpu"];
+    let eval = [&eval[..], &["--metrics", "psnr", "--pictures", "none", "-o", text(&evaluation)]].concat();
+    let eval = freerange(&eval);
+    assert!(eval.status.success(), "{}", String::from_utf8_lossy(&eval.stderr));
+    let tables = freerange(&["eval", "paper-tables", text(&path("rows"))]);
+    let said = String::from_utf8_lossy(&tables.stdout).into_owned();
+    assert!(said.contains("| Full |") && said.contains("Not measured yet: Full, another seed;"), "{said}");
+    let nothing = freerange(&["eval", "paper-tables", text(&path("run"))]);
+    assert_eq!(nothing.status.code(), Some(2), "{}", String::from_utf8_lossy(&nothing.stderr));
+}
