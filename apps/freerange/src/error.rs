@@ -120,6 +120,7 @@ impl From<FlowError> for CliError {
             FlowError::Fit(e) => e.into(),
             FlowError::NotFinite { .. }
             | FlowError::NoGradient
+            | FlowError::Device { .. }
             | FlowError::Cancelled
             | FlowError::Ranks { .. }
             | FlowError::Elsewhere { .. } => Self::failure(e),
@@ -215,7 +216,8 @@ mod tests {
             CliError::file(Path::new("a"), "expected a folder"),
         ];
         assert_eq!(input.map(|e| e.exit_code()), [2; 4]);
-        let failures: [CliError; 8] = [
+        let failures: [CliError; 9] = [
+            FlowError::Device { problem: "lost".into() }.into(),
             data(io::ErrorKind::StorageFull).into(),
             FlowError::Data(data(io::ErrorKind::ConnectionReset)).into(),
             CliError::file(Path::new("a"), io::Error::from(io::ErrorKind::StorageFull)),
@@ -225,7 +227,7 @@ mod tests {
             DataError::Worker { index: 1 }.into(),
             FlowError::NoGradient.into(),
         ];
-        assert_eq!(failures.map(|e| e.exit_code()), [1; 8]);
+        assert_eq!(failures.map(|e| e.exit_code()), [1; 9]);
     }
 
     #[test]

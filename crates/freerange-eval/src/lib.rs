@@ -26,5 +26,5 @@ pub use error::EvalError;
 pub use folder::{Features, RunFolder, differences};
 pub use object::{EvalObject, Inputs};
 pub use report::{Environment, FORMAT, FrechetVgg, Group, Report, Spread};
-pub use scorer::{HIGHEST_PSNR, Pair, Scorer, ScorerConfig, Scores, UsedFile, fid, frechet_vgg};
+pub use scorer::{Pair, Scorer, ScorerConfig, Scores, UsedFile, fid, frechet_vgg};
 pub use strip::strip;

@@ -2,14 +2,11 @@
 
 use std::{collections::BTreeMap, path::PathBuf};
 
-use freerange_metrics::{Metric, psnr, ssim_3dgs, ssim_skimage_gauss, ssim_skimage_sample};
+use freerange_metrics::{Metric, capped_psnr, ssim_3dgs, ssim_skimage_gauss, ssim_skimage_sample};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::EvalError;
-
-/// PSNR of equal images, in dB. It is infinite, but a mean has to exist; 8-bit images cannot differ by so little.
-pub const HIGHEST_PSNR: f64 = 100.0;
 
 /// What a [`Scorer`] computes.
 #[derive(Clone, Debug, PartialEq)]
@@ -138,7 +135,7 @@ impl Scorer {
             let (a, b, [width, height]) = (pair.render, pair.truth, pair.size);
             let value = |metric: Metric| {
                 Ok::<f64, EvalError>(match metric {
-                    Metric::Psnr => psnr(a, b)?.min(HIGHEST_PSNR),
+                    Metric::Psnr => capped_psnr(a, b)?,
                     Metric::SsimCropped => ssim_skimage_gauss(a, b, width, height)?,
                     Metric::SsimSample => ssim_skimage_sample(a, b, width, height)?,
                     _ => ssim_3dgs(a, b, width, height)?,

@@ -1,15 +1,12 @@
 //! How well Gaussians show an object.
 
 use freerange_camera::{Camera, View};
-use freerange_metrics::psnr;
+use freerange_metrics::capped_psnr;
 use freerange_raster::RasterConfig;
 use freerange_splat::Cloud;
 use image::RgbaImage;
 
 use crate::FitError;
-
-/// Renders that agree to the last bit would have infinite PSNR; this keeps means finite.
-const BEST_PSNR: f64 = 100.0;
 
 /// PSNR in dB of renders of `cloud` against `views`, in front of white: mean over the views.
 ///
@@ -21,7 +18,7 @@ pub fn psnr_over_white(cloud: &Cloud, views: &[View]) -> Result<f64, FitError> {
     }
     let mut sum = 0.0;
     for view in views {
-        sum += psnr(&render_over_white(cloud, &view.camera)?, &over_white(&view.image))?.min(BEST_PSNR);
+        sum += capped_psnr(&render_over_white(cloud, &view.camera)?, &over_white(&view.image))?;
     }
     Ok(sum / views.len() as f64)
 }

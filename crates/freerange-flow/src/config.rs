@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use freerange_core::Invalid;
+use freerange_core::{Invalid, check};
 use freerange_data::Making;
 use freerange_model::{Compute, ModelConfig, ModelKind};
 
@@ -291,6 +291,22 @@ pub enum RateSchedule {
 }
 
 impl OptimizerConfig {
+    /// Refuses what no step could be taken with.
+    fn validate(&self) -> Result<(), Invalid> {
+        let (high, low) = (self.learning_rate, self.final_learning_rate);
+        check(high.is_finite() && high > 0.0, "optimizer.learning_rate", "a finite number above 0", high)?;
+        check(low.is_finite() && low >= 0.0, "optimizer.final_learning_rate", "a finite number, 0 or more", low)?;
+        let decay = self.weight_decay;
+        check(decay.is_finite() && decay >= 0.0, "optimizer.weight_decay", "a finite number, 0 or more", decay)?;
+        let below_one = |beta: f32| (0.0..1.0).contains(&beta);
+        let (first, second) = self.betas;
+        check(below_one(first) && below_one(second), "optimizer.betas", "two numbers, 0 to below 1", self.betas)?;
+        check(below_one(self.ema), "optimizer.ema", "0 to below 1", self.ema)?;
+        check(self.clip > 0.0, "optimizer.clip", "above 0", self.clip)?;
+        // Nothing scales the loss here, and without that the gradients of many weights round to zero.
+        check(self.compute != Compute::F16, "optimizer.compute", "\"f32\" or \"bf16\"", "f16")
+    }
+
     /// The learning rate of step `step` of `total`: linear warm-up, then the schedule.
     pub fn rate(&self, step: u64, total: u64) -> f64 {
         if step < self.warmup {
@@ -499,12 +515,8 @@ impl<M: Making> TrainConfig<M> {
             check((8..=2048).contains(&size), field, "8 to 2048", size.to_string())?;
         }
         self.validate_kind()?;
-        let o = &self.optimizer;
-        check(o.learning_rate > 0.0, "optimizer.learning_rate", "above 0", o.learning_rate.to_string())?;
-        check((0.0..1.0).contains(&o.ema), "optimizer.ema", "0 to below 1", o.ema.to_string())?;
-        check(o.clip > 0.0, "optimizer.clip", "above 0", o.clip.to_string())?;
-        // Nothing scales the loss here, and without that the gradients of many weights round to zero.
-        check(o.compute != Compute::F16, "optimizer.compute", "\"f32\" or \"bf16\"", "\"f16\"".into())?;
+        l.time.validate()?;
+        self.optimizer.validate()?;
         let lanes = self.data.lanes;
         check((1..=4096).contains(&lanes), "data.lanes", "1 to 4096", lanes.to_string())?;
         let of_lanes = format!("a multiple of data.lanes, {lanes}");

@@ -2,14 +2,29 @@ use std::path::PathBuf;
 
 use freerange_core::{Invalid, IoError};
 
+impl FlowError {
+    /// Of a failed read-back.
+    pub(crate) fn device(problem: impl std::fmt::Debug) -> Self {
+        Self::Device { problem: format!("{problem:?}") }
+    }
+}
+
 /// What can go wrong in training and sampling.
 #[derive(Debug, thiserror::Error)]
 pub enum FlowError {
     /// An object without views was given.
     #[error("an object without views: at least one posed image is needed")]
     NoViews,
-    /// Views of one batch differ in size or number.
-    #[error("views of one batch must agree in number and size: expected {}x{} pixels, found {}x{}", expected.0, expected.1, found.0, found.1)]
+    /// Objects of one batch differ in their number of views.
+    #[error("objects of one batch must have equally many views: expected {expected}, found {found}")]
+    UnevenNumbers {
+        /// Views of the first object.
+        expected: usize,
+        /// Views of the object that differs.
+        found: usize,
+    },
+    /// Views of one batch differ in size.
+    #[error("views of one batch must agree in size: expected {}x{} pixels, found {}x{}", expected.0, expected.1, found.0, found.1)]
     UnevenViews {
         /// Size of the first view.
         expected: (u32, u32),
@@ -25,6 +40,12 @@ pub enum FlowError {
         expected: String,
         /// What it has.
         found: String,
+    },
+    /// What was computed could not be read back from the device: it, or its driver, has failed.
+    #[error("the device failed: {problem}")]
+    Device {
+        /// What it says.
+        problem: String,
     },
     /// A gradient was asked for where nothing was differentiated.
     #[error("no gradient reached the Gaussians")]

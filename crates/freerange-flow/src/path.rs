@@ -4,6 +4,7 @@
 //! ("x-prediction"), from which the velocity follows.
 
 use burn::tensor::Tensor;
+use freerange_core::{Invalid, check};
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 
@@ -65,6 +66,13 @@ pub enum TimeSchedule {
 }
 
 impl TimeSchedule {
+    /// Refuses parameters that no time can be drawn with.
+    pub fn validate(self) -> Result<(), Invalid> {
+        let Self::LogitNormal { mean, deviation } = self else { return Ok(()) };
+        check(mean.is_finite(), "loss.time.mean", "a finite number", mean)?;
+        check(deviation.is_finite() && deviation >= 0.0, "loss.time.deviation", "a finite number, 0 or more", deviation)
+    }
+
     /// Draws a time.
     pub fn draw(self, rng: &mut impl Rng) -> f32 {
         match self {

@@ -32,8 +32,8 @@ impl Images {
                 return Err(FlowError::UnevenViews { expected: (w, h), found: view.image.dimensions() });
             }
         }
-        if objects.iter().any(|object| object.len() != views) {
-            return Err(FlowError::UnevenViews { expected: (w, h), found: (w, h) });
+        if let Some(other) = objects.iter().find(|object| object.len() != views) {
+            return Err(FlowError::UnevenNumbers { expected: views, found: other.len() });
         }
         let split = |object: &Vec<&View>| {
             let pixels = object.iter().flat_map(|view| to_f32_rgba(&view.image).as_chunks::<4>().0.to_vec());
@@ -325,7 +325,8 @@ mod tests {
         let view = |w| View { name: String::new(), camera, image: RgbaImage::new(w, 4) };
         let (a, b) = (view(4), view(5));
         assert!(matches!(Images::new(&[vec![&a, &b]], &Device::flex()), Err(FlowError::UnevenViews { .. })));
-        assert!(matches!(Images::new(&[vec![&a], vec![&a, &a]], &Device::flex()), Err(FlowError::UnevenViews { .. })));
+        let uneven = Images::new(&[vec![&a], vec![&a, &a]], &Device::flex()).err().unwrap().to_string();
+        assert!(uneven.contains("equally many views: expected 1, found 2"), "{uneven}");
         assert!(matches!(Images::new(&[], &Device::flex()), Err(FlowError::NoViews)));
     }
 }

@@ -116,7 +116,7 @@ impl Estimate<'_> {
 /// Raw channels as Gaussians. `[objects * seeds, n, 14]` to `[objects][seeds]`
 fn clouds(raw: Tensor<3>, seeds: usize) -> Result<Vec<Vec<Cloud>>, FlowError> {
     let row = raw.dims()[1] * channel::COUNT;
-    let values = raw.into_data().try_to_vec::<f32>().map_err(|_| FlowError::NoGradient)?;
+    let values = raw.into_data().try_to_vec::<f32>().map_err(FlowError::device)?;
     let cloud = |rows: &[f32]| {
         let mut cloud = Cloud::from_rows(rows.to_vec());
         cloud.canonicalize_rotations();

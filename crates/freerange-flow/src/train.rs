@@ -26,7 +26,7 @@ pub struct Losses {
     pub seen: Tensor<1>,
     /// L1 over held-out views, without its weight. `[1]`
     pub held: Tensor<1>,
-    /// Mean square of each channel of the photometric gradient over conditional samples, where there was one. `[14]`
+    /// Mean square of each channel of the photometric gradient over all samples, where there was one. `[14]`
     pub gradient_square: Option<Tensor<1>>,
 }
 

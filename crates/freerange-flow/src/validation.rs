@@ -198,8 +198,8 @@ impl Validation {
                 Batch::draw(one, stage, &model_config, &config.loss, &checkpoint.normalization, &mut rng, device)?;
             let losses = train::step(tracked, batch, &photometric, &rms, &config.loss, device)?;
             let figures = Tensor::cat(vec![losses.flow, losses.seen, losses.held], 0).into_data();
-            let figures = figures.try_to_vec::<f32>().map_err(|_| FlowError::NoGradient)?;
-            let &[flow, seen, held] = figures.as_slice() else { return Err(FlowError::NoGradient) };
+            let figures = figures.try_to_vec::<f32>().map_err(FlowError::device)?;
+            let &[flow, seen, held] = figures.as_slice() else { return Err(FlowError::device(&figures)) };
             let mut psnr = Vec::new();
             for (inputs, others, fit) in self.tasks(object, config, *number) {
                 // The size that objects come in is the size that they are sampled and compared at.

@@ -454,3 +454,31 @@ fn a_fit_is_mended() {
     assert_eq!(anew, regrouped);
     assert_ne!(straight, regrouped);
 }
+
+/// What a network says that does not look at its images is the same with and without them: no guidance changes it.
+#[test]
+fn guidance_of_a_network_that_ignores_its_images_changes_nothing() {
+    let mut config = config(1);
+    config.model.estimate_channels = true;
+    config.model.observation_channels = true;
+    config.model.preconditioning = Some([0.5; channel::COUNT]);
+    config.sample.gradient_at = freerange_flow::sample::GradientAt::Estimate;
+    config.sample = SampleConfig { steps: 4, lambda_pg: 0.0, ..config.sample };
+    let place = tempfile::tempdir().unwrap();
+    // Before the first step the last layer is zero: the network corrects nothing.
+    train(&config, place.path(), 0);
+    let device = Device::flex();
+    let checkpoint = Checkpoint::load(&place.path().join("checkpoint.safetensors"), &device).unwrap();
+    let source = Generated { config: config.data.making.object.clone(), depths: config.depths(), seed: 7 };
+    let views = source.object(0).unwrap().views;
+    let sample = |cfg_scale: f32| {
+        let config = SampleConfig { cfg_scale, ..config.sample.clone() };
+        let go = ControlFlow::Continue(());
+        reconstruct(&checkpoint, &[&views[..4]], None, &config, &[5], &device, |_| go).unwrap().remove(0).remove(0)
+    };
+    let plain = sample(1.0);
+    for scale in [0.0, 1.5, 3.0] {
+        let difference = sample(scale).rows().iter().zip(plain.rows()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(difference < 1e-3, "s = {scale}: {difference}");
+    }
+}

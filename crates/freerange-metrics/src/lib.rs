@@ -25,7 +25,7 @@ pub use metric::Metric;
 pub use networks::{
     Evaluator, EvaluatorConfig, Inception, Lpips, LpipsNet, NotComputed, Pair, Scores, VGG_WIDTH, cosine_similarity,
 };
-pub use pixel::{l1, mse, psnr, psnr_from_mse};
+pub use pixel::{HIGHEST_PSNR, capped_psnr, l1, mse, psnr, psnr_from_mse};
 pub use ssim::{photometric_loss, ssim_3dgs, ssim_with_gradient};
 pub use ssim_cropped::{ssim_skimage_gauss, ssim_skimage_sample};
 

@@ -28,6 +28,16 @@ pub fn psnr(first: &[f32], second: &[f32]) -> Result<f64, MetricsError> {
     mse(first, second).map(psnr_from_mse)
 }
 
+/// Where means of PSNR are taken, equal images count so many dB: 8-bit images cannot differ by so little.
+pub const HIGHEST_PSNR: f64 = 100.0;
+
+/// [`psnr`], at most [`HIGHEST_PSNR`], so that it has a mean. NaN where a value of the images is NaN.
+pub fn capped_psnr(first: &[f32], second: &[f32]) -> Result<f64, MetricsError> {
+    let db = psnr(first, second)?;
+    // `min` would make the best of what is no number.
+    Ok(if db > HIGHEST_PSNR { HIGHEST_PSNR } else { db })
+}
+
 /// PSNR in dB of a mean squared error, for a peak of 1.
 pub fn psnr_from_mse(mse: f64) -> f64 {
     -10.0 * mse.log10()

@@ -91,6 +91,14 @@ fn sizes_that_do_not_fit_are_refused() {
 fn a_nan_pixel_does_not_pass() {
     let (mut a, b) = (vec![0.5; 3 * 16], vec![0.5; 3 * 16]);
     a[5] = f32::NAN;
-    assert!(psnr(&a, &b).unwrap().is_nan());
+    assert!(psnr(&a, &b).unwrap().is_nan() && capped_psnr(&a, &b).unwrap().is_nan());
     assert!(ssim_3dgs(&a, &b, 4, 4).unwrap().is_nan());
+}
+
+#[test]
+fn equal_images_have_a_mean() {
+    let (a, b) = (vec![0.5; 12], vec![0.25; 12]);
+    assert_eq!(psnr(&a, &a).unwrap(), f64::INFINITY);
+    assert_eq!(capped_psnr(&a, &a).unwrap(), HIGHEST_PSNR);
+    assert_eq!(capped_psnr(&a, &b).unwrap(), psnr(&a, &b).unwrap());
 }

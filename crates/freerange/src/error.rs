@@ -61,7 +61,12 @@ impl Error {
             Self::Cancelled
                 | Self::BrokenDevice(_)
                 | Self::Fit(freerange_fit::FitError::Diverged { .. })
-                | Self::Flow(FlowError::NotFinite { .. } | FlowError::NoGradient | FlowError::Cancelled)
+                | Self::Flow(
+                    FlowError::NotFinite { .. }
+                        | FlowError::NoGradient
+                        | FlowError::Device { .. }
+                        | FlowError::Cancelled
+                )
         )
     }
 

@@ -1,5 +1,5 @@
 use freerange_camera::{View, image_ops::composite};
-use freerange_metrics::{psnr, ssim_3dgs};
+use freerange_metrics::{capped_psnr, ssim_3dgs};
 use freerange_splat::Cloud;
 use serde::Serialize;
 
@@ -13,7 +13,7 @@ use crate::{
 pub struct ViewScore {
     /// The view.
     pub name: String,
-    /// Peak signal-to-noise ratio, dB.
+    /// Peak signal-to-noise ratio, dB; at most 100, which stands for equal images.
     pub psnr: f64,
     /// Structural similarity as the 3DGS papers compute it (11 x 11 Gaussian window, zero padding).
     pub ssim: f64,
@@ -33,7 +33,7 @@ pub struct Scores {
 /// Compares renders of `cloud` with `views`; both in one frame. None for no views.
 ///
 /// # Errors
-/// If a render or a metric is refused.
+/// If a render or a metric is refused, or Gaussians render as what is no number.
 pub fn score(cloud: &Cloud, views: &[View]) -> Result<Option<Scores>, Error> {
     let scored = views
         .iter()
@@ -42,11 +42,12 @@ pub fn score(cloud: &Cloud, views: &[View]) -> Result<Option<Scores>, Error> {
             // As a viewer would see it: clamped to the range of a picture.
             let render: Vec<f32> = render_view(cloud, &view.camera)?.iter().map(|x| x.clamp(0.0, 1.0)).collect();
             let truth = composite(&view.image, WHITE);
-            Ok(ViewScore {
-                name: view.name.clone(),
-                psnr: psnr(&render, &truth)?,
-                ssim: ssim_3dgs(&render, &truth, w as usize, h as usize)?,
-            })
+            let psnr = capped_psnr(&render, &truth)?;
+            if psnr.is_nan() {
+                return Err(Error::input(format!("render of view {}", view.name), "finite colors", psnr));
+            }
+            let ssim = ssim_3dgs(&render, &truth, w as usize, h as usize)?;
+            Ok(ViewScore { name: view.name.clone(), psnr, ssim })
         })
         .collect::<Result<Vec<_>, Error>>()?;
     if scored.is_empty() {

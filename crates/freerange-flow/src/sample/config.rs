@@ -30,7 +30,8 @@ pub struct SampleConfig {
     pub depth: Option<u32>,
     /// Start from a quick fit of the input views instead of pure noise.
     pub start: Option<StartConfig>,
-    /// Classifier-free guidance scale s: `z_u + s (z_c - z_u)`. 1 switches it off (and halves the work).
+    /// Classifier-free guidance scale s: `z_u + s (z_c - z_u)`. 1 switches it off (and halves the work). Only 1 goes with
+    /// `start`: a fit is made of the images, and no model is trained to do without them from there.
     #[serde(alias = "guidance")]
     pub cfg_scale: f32,
     /// Photometric guidance scale lambda_PG. 0 switches it off. What it multiplies is told by `photometric_step`. It acts
@@ -156,7 +157,8 @@ impl SampleConfig {
     /// How samples from pure noise are mended: see [`mend`](Self::mend); none if they are not.
     pub fn mending(&self) -> Option<Self> {
         let start = StartConfig { time: 0.0, noise: 0.0, ..StartConfig::default() };
-        let held = Self { steps: self.mend, solver: Solver::Hold, start: Some(start), lambda_pg: 0.0, ..self.clone() };
+        let (solver, start) = (Solver::Hold, Some(start));
+        let held = Self { steps: self.mend, solver, start, cfg_scale: 1.0, lambda_pg: 0.0, ..self.clone() };
         (self.mend > 0 && self.start.is_none()).then_some(held)
     }
 
@@ -238,6 +240,13 @@ impl SampleConfig {
         }
         if !self.cfg_scale.is_finite() || self.cfg_scale < 0.0 {
             return bad("cfg_scale", "a finite number, 0 or more", self.cfg_scale.to_string());
+        }
+        if self.cfg_scale != 1.0 && self.start.is_some() {
+            return bad(
+                "cfg_scale",
+                "1 with sample.start (other scales go with a start from noise)",
+                self.cfg_scale.to_string(),
+            );
         }
         if !self.lambda_pg.is_finite() || self.lambda_pg < 0.0 {
             return bad("lambda_pg", "a finite number, 0 or more", self.lambda_pg.to_string());
@@ -328,11 +337,20 @@ mod tests {
             steps: 4,
             solver: Solver::Hold,
             start: Some(StartConfig::default()),
+            cfg_scale: 1.0,
             lambda_pg: 0.0,
             from_noise: Some(noise),
             ..SampleConfig::default()
         };
         fit.validate().unwrap();
+        // Guidance goes with noise only.
+        let guided = SampleConfig { cfg_scale: 1.5, ..fit.clone() };
+        let message = guided.validate().unwrap_err().to_string();
+        assert!(message.contains("sample.cfg_scale: expected 1") && message.contains("sample.start"), "{message}");
+        let guided = guided.without_start();
+        guided.validate().unwrap();
+        assert_eq!((guided.cfg_scale, guided.mending().unwrap().cfg_scale), (1.5, 1.0));
+        guided.mending().unwrap().validate().unwrap();
         let found = fit.clone().without_start();
         found.validate().unwrap();
         assert_eq!((found.steps, found.solver, found.lambda_pg, found.polish), (30, Solver::Multistep, 0.2, 7));

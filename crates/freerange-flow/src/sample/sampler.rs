@@ -63,6 +63,8 @@ pub(super) struct Sampler<'a> {
     backgrounds: &'a [Vec<[f32; 3]>],
     /// The latest estimate of the clean sample.
     previous: RefCell<Option<Tensor<3>>>,
+    /// That of the network without images: what it is fed back there, as in training.
+    without_images: RefCell<Option<Tensor<3>>>,
 }
 
 impl<'a> Sampler<'a> {
@@ -105,6 +107,7 @@ impl<'a> Sampler<'a> {
             guiding,
             backgrounds: &drawn.backgrounds,
             previous: RefCell::new(drawn.guess.clone()),
+            without_images: RefCell::new(None),
         })
     }
 
@@ -125,13 +128,17 @@ impl<'a> Sampler<'a> {
             let z = step.z.clone().repeat_dim(0, 2);
             let blind = |x: Tensor<3>| Tensor::cat(vec![x.clone(), x.zeros_like()], 0);
             let t = Tensor::full([2 * b], step.t, self.device);
+            // Zeros would be an estimate: of Gaussians that all lie in one place.
+            let estimates = feedback.estimate.zip(self.without_images.take());
             let feedback = Feedback {
                 gradient: feedback.gradient.map(blind),
-                estimate: feedback.estimate.map(blind),
+                estimate: estimates.map(|(own, without)| Tensor::cat(vec![own, without], 0)),
                 observation: feedback.observation.map(blind),
             };
             let out = self.model.denoise(z, feedback, self.both.clone(), t);
-            classifier_free(out.clone().narrow(0, 0, b), out.narrow(0, b, b), self.config.cfg_scale)
+            let without = out.clone().narrow(0, b, b);
+            self.without_images.replace(Some(without.clone()));
+            classifier_free(out.narrow(0, 0, b), without, self.config.cfg_scale)
         };
         self.previous.replace(Some(estimate.clone()));
         Ok(estimate)

@@ -40,7 +40,7 @@ struct Summed {
 
 /// The values of a tensor that is small.
 fn numbers(t: Tensor<1>) -> Result<Vec<f32>, FlowError> {
-    t.into_data().try_to_vec::<f32>().map_err(|_| FlowError::NoGradient)
+    t.into_data().try_to_vec::<f32>().map_err(FlowError::device)
 }
 
 impl Trainer {
@@ -60,7 +60,8 @@ impl Trainer {
             1 => self.alone(computed?)?,
             _ => self.summed(computed, begin)?,
         };
-        let (&[norm, total, flow, seen, held], square) = figures.split_first_chunk().ok_or(FlowError::NoGradient)?;
+        let (&[norm, total, flow, seen, held], square) =
+            figures.split_first_chunk().ok_or_else(|| FlowError::device(&figures))?;
         let o = &self.config.optimizer;
         let rate = o.rate(index, total_steps);
         let finite = figures.iter().all(|x| x.is_finite());
@@ -188,7 +189,7 @@ impl Trainer {
         let computed = computed.and_then(|computed| {
             // Else a device would seem fast that has only been told what to do.
             let synced = self.device.sync();
-            synced.map(|()| computed).map_err(|e| FlowError::Ranks { problem: format!("the device failed: {e}") })
+            synced.map(|()| computed).map_err(FlowError::device)
         });
         let (computed, failure) = match computed {
             Ok(computed) => (Some(computed), None),

@@ -248,6 +248,31 @@ fn training_in_f16_is_refused() {
 }
 
 #[test]
+fn an_optimizer_that_cannot_take_a_step_is_refused() {
+    let refused = |text: &str| {
+        let field = text.split(" =").next().unwrap();
+        let config = SMALL.replace("[[stage]]", &format!("[optimizer]\n{text}\n\n[[stage]]"));
+        let config: TrainConfig = toml::from_str(&config).unwrap();
+        let error = config.validate().unwrap_err().to_string();
+        assert!(error.contains(&format!("optimizer.{field}: expected")), "{text}: {error}");
+    };
+    for bad in ["betas = [1.0, 0.95]", "betas = [0.9, 1.0]", "betas = [-0.1, 0.9]", "betas = [nan, 0.9]"] {
+        refused(bad);
+    }
+    refused("learning_rate = nan");
+    refused("learning_rate = inf");
+    refused("final_learning_rate = -1e-6");
+    refused("weight_decay = nan");
+    refused("weight_decay = -0.01");
+    refused("clip = nan");
+    let mut config = config();
+    for (mean, deviation) in [(0.0, -1.0), (0.0, f32::NAN), (f32::INFINITY, 1.0)] {
+        config.loss.time = crate::path::TimeSchedule::LogitNormal { mean, deviation };
+        assert!(config.validate().unwrap_err().to_string().contains("loss.time."));
+    }
+}
+
+#[test]
 fn a_run_finds_its_shards_from_any_folder() {
     let place = tempfile::tempdir().unwrap();
     let run = place.path().join("run");

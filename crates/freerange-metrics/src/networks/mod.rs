@@ -13,7 +13,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 
 use crate::weights::{UsedFile, Weights};
 use crate::{
-    CHANNELS, Metric, MetricsError, error::check_size, psnr, ssim_3dgs, ssim_skimage_gauss, ssim_skimage_sample,
+    CHANNELS, Metric, MetricsError, capped_psnr, error::check_size, ssim_3dgs, ssim_skimage_gauss, ssim_skimage_sample,
 };
 use dino::Dino;
 use dreamsim::DreamSim;
@@ -251,7 +251,7 @@ impl Evaluator {
                 let (a, b) = (pair.render, pair.truth);
                 let value = |metric: Metric| {
                     Ok(match metric {
-                        Metric::Psnr => psnr(a, b)?,
+                        Metric::Psnr => capped_psnr(a, b)?,
                         Metric::Ssim => ssim_3dgs(a, b, width, height)?,
                         Metric::SsimCropped => ssim_skimage_gauss(a, b, width, height)?,
                         Metric::SsimSample => ssim_skimage_sample(a, b, width, height)?,

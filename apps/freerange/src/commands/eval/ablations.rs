@@ -26,12 +26,10 @@ pub struct Args {
     /// ablations.md and ablations.json.
     #[arg(short, long, value_name = "OUT")]
     output: PathBuf,
-    /// What is varied, one setting at a time.
-    #[arg(
-        long, value_delimiter = ',', value_name = "SETS", value_parser = set,
-        default_value = "guidance,steps,lambda,scale,gradient,inputs,solver"
-    )]
-    sets: Vec<Set>,
+    /// What is varied, one setting at a time: guidance, steps, lambda, scale, gradient, inputs, solver [default: those
+    /// that apply to the checkpoint's way of sampling].
+    #[arg(long, value_delimiter = ',', value_name = "SETS", value_parser = set)]
+    sets: Option<Vec<Set>>,
     /// Numbers of steps of the sets `steps` and `solver`.
     #[arg(long, value_delimiter = ',', value_name = "NUMBERS", default_value = "5,10,20,50,100")]
     step_counts: Vec<usize>,
@@ -55,6 +53,32 @@ pub struct Args {
 fn set(text: &str) -> Result<Set, String> {
     let names: Vec<&str> = Set::ALL.map(Set::name).into();
     Set::ALL.into_iter().find(|s| s.name() == text).ok_or_else(|| format!("expected one of {}", names.join(", ")))
+}
+
+/// The sets that are asked for, or all that apply to a default `sample`: from a fit there is no classifier-free guidance,
+/// and multiples of no photometric guidance are none.
+fn sets(asked: Option<&[Set]>, sample: &SampleConfig, lambdas: bool) -> Result<Vec<Set>, CliError> {
+    let guided = sample.cfg_scale != 1.0 || sample.lambda_pg != 0.0;
+    let applies = |set: &Set| match set {
+        Set::Guidance => guided,
+        Set::Lambda => lambdas || sample.lambda_pg != 0.0,
+        Set::Scale => sample.start.is_none(),
+        Set::Steps | Set::Gradient | Set::Inputs | Set::Solver => true,
+    };
+    let Some(asked) = asked else { return Ok(Set::ALL.into_iter().filter(applies).collect()) };
+    match asked.iter().find(|set| !applies(set)) {
+        None => Ok(asked.to_vec()),
+        Some(Set::Lambda) => {
+            Err(CliError::input("--sets lambda: expected --lambdas too, found multiples of the default, which is 0"))
+        }
+        Some(Set::Scale) => Err(CliError::input(
+            "--sets scale: expected --start noise, found a start from a fit, which s = 1 goes with alone",
+        )),
+        Some(set) => {
+            let name = set.name();
+            Err(CliError::input(format!("--sets {name}: expected guidance to leave out, found none in the default")))
+        }
+    }
 }
 
 /// The folder of the default settings.
@@ -130,6 +154,7 @@ impl Args {
 
     /// The variants, and in what they differ from the default.
     fn plan(&self, default: &Options, inputs: usize) -> Result<Vec<(Variant, Different)>, CliError> {
+        let sets = sets(self.sets.as_deref(), &default.sample, self.lambdas.is_some())?;
         let multiples = || [0.25, 0.5, 2.0, 4.0].map(|factor| factor * default.sample.lambda_pg).into();
         let values = Values {
             steps: self.step_counts.clone(),
@@ -144,7 +169,7 @@ impl Args {
             let same = options.sample == default.sample && count == inputs;
             Ok((variant, (!same).then_some((options, count))))
         };
-        variants(&self.sets, &values).into_iter().map(plan).collect()
+        variants(&sets, &values).into_iter().map(plan).collect()
     }
 
     /// The reports of all runs, and the study of them.
@@ -208,4 +233,24 @@ fn document(study: &Study, environment: &freerange_eval::Environment) -> String 
         out.push('\n');
     }
     out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sets_apply_to_the_way_of_sampling() {
+        let noise = SampleConfig { cfg_scale: 1.5, lambda_pg: 0.035, ..SampleConfig::default() };
+        assert_eq!(sets(None, &noise, false).unwrap(), Set::ALL);
+        let start = Some(freerange::StartConfig::default());
+        let fit = SampleConfig { cfg_scale: 1.0, lambda_pg: 0.0, start, ..SampleConfig::default() };
+        assert_eq!(sets(None, &fit, false).unwrap(), [Set::Steps, Set::Gradient, Set::Inputs, Set::Solver]);
+        assert!(sets(None, &fit, true).unwrap().contains(&Set::Lambda));
+        for (set, word) in [(Set::Guidance, "guidance"), (Set::Lambda, "--lambdas"), (Set::Scale, "--start noise")] {
+            let text = sets(Some(&[Set::Steps, set]), &fit, false).unwrap_err().to_string();
+            assert!(text.contains(word) && text.contains("--sets"), "{text}");
+            assert_eq!(sets(Some(&[set]), &noise, false).unwrap(), [set]);
+        }
+    }
 }
