@@ -14,17 +14,18 @@ fuzz_target!(|data: &[u8]| {
         b'z' => Format::Spz,
         b's' => Format::Sog,
         b'g' => Format::Glb,
+        b'u' => Format::Usda,
         b'h' => Format::Html,
         _ => return,
     };
     if let Ok(loaded) = parse(format, file, Path::new("fuzzed"), Frame::Z_UP) {
-        assert!(loaded.cloud.check_finite().is_ok());
-        if !loaded.cloud.is_empty() && loaded.cloud.len() < 1000 {
+        assert!(loaded.splats.cloud.check_finite().is_ok());
+        if !loaded.splats.cloud.is_empty() && loaded.splats.cloud.len() < 1000 {
             for other in Format::ALL {
-                let bytes = encode(&loaded.cloud, other, &WriteOptions::default()).expect("finite Gaussians").bytes;
+                let bytes = encode(&loaded.splats, other, &WriteOptions::default()).expect("finite Gaussians").bytes;
                 let again = parse(other, &bytes, Path::new("written"), Frame::Z_UP);
                 // Far beyond what 32 bits hold, sums and turns overflow: an error, but no panic.
-                let _ = again.map(|a| assert_eq!(a.cloud.len(), loaded.cloud.len()));
+                let _ = again.map(|a| assert_eq!(a.splats.cloud.len(), loaded.splats.cloud.len()));
             }
         }
     }

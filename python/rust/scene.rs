@@ -126,15 +126,19 @@ fn frame(up: [f64; 3]) -> PyResult<Frame> {
 pub fn write_gaussians(py: Python<'_>, rows: PyBackedBytes, path: PathBuf, up: [f64; 3]) -> PyResult<Vec<String>> {
     let cloud = cloud(&rows)?;
     let options = WriteOptions { frame: frame(up)?, ..WriteOptions::default() };
-    py.detach(|| freerange_formats::write(&cloud, &path, &options)).map_err(of_format)
+    py.detach(|| freerange_formats::write(&cloud.into(), &path, &options)).map_err(of_format)
 }
 
 /// Reads Gaussians from a file; those that fix their frame are turned into the one in which `up` is up.
 #[pyfunction]
 pub fn read_gaussians(py: Python<'_>, path: PathBuf, up: [f64; 3]) -> PyResult<(Py<PyByteArray>, Vec<String>)> {
     let frame = frame(up)?;
-    let loaded = py.detach(|| freerange_formats::read(&path, frame)).map_err(of_format)?;
-    Ok((bytes(py, loaded.cloud.rows()), loaded.notes))
+    let mut loaded = py.detach(|| freerange_formats::read(&path, frame)).map_err(of_format)?;
+    let degree = loaded.splats.harmonics.degree();
+    if degree > 0 {
+        loaded.notes.push(format!("color that depends on the viewing direction (degree {degree}) is left out"));
+    }
+    Ok((bytes(py, loaded.splats.into_cloud().rows()), loaded.notes))
 }
 
 fn cloud(rows: &[u8]) -> PyResult<Cloud> {

@@ -193,7 +193,8 @@ other_errors!(
     freerange_model::ModelError,
     freerange_raster::RasterError,
     freerange_scene::SceneError,
-    freerange_splat::SplatError
+    freerange_splat::SplatError,
+    freerange_surface::SurfaceError
 );
 
 #[cfg(test)]

@@ -22,6 +22,7 @@ const ROOMS: &[(&str, &[&str])] = &[
     ("freerange-mesh", &["freerange-core"]),
     ("freerange-render", &["freerange-core", "freerange-camera", "freerange-mesh"]),
     ("freerange-generate", &["freerange-core", "freerange-mesh"]),
+    ("freerange-surface", &["freerange-core", "freerange-splat", "freerange-camera", "freerange-raster"]),
     (
         "freerange-fit",
         &["freerange-core", "freerange-splat", "freerange-camera", "freerange-raster", "freerange-metrics"],

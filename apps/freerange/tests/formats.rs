@@ -50,7 +50,7 @@ fn convert_goes_to_every_format_and_back() {
             assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
             assert!(String::from_utf8_lossy(&done.stdout).contains("10 Gaussians"));
         }
-        let found = read(&back, Frame::Y_DOWN).unwrap().cloud;
+        let found = read(&back, Frame::Y_DOWN).unwrap().splats.cloud;
         for i in 0..10 {
             assert!((found.mean(i) - cloud.mean(i)).length() < 1e-4, "{extension}");
             assert!(found.covariance(i).abs_diff_eq(cloud.covariance(i), 2e-4), "{extension}");
@@ -59,7 +59,7 @@ fn convert_goes_to_every_format_and_back() {
     // From a frame into another.
     let turned = folder.path().join("turned.ply");
     assert!(freerange(&["convert", text(&source), text(&turned), "--frame", "y-down:z-up"]).status.success());
-    let found = read(&turned, Frame::Z_UP).unwrap().cloud;
+    let found = read(&turned, Frame::Z_UP).unwrap().splats.cloud;
     let expected = |m: DVec3| DVec3::new(m.x, m.z, -m.y);
     assert!((0..10).all(|i| (found.mean(i) - expected(cloud.mean(i))).length() < 1e-6));
 }
@@ -75,10 +75,10 @@ fn what_cannot_be_converted_is_refused() {
         words.iter().for_each(|w| assert!(message.contains(w), "expected {w:?} in: {message}"));
         assert!(!message.contains("panicked") && !output.exists());
     };
-    refused(&source, &folder.path().join("out.usdz"), &[], &["out.usdz", ".spz", "found .usdz"]);
+    refused(&source, &folder.path().join("out.fbx"), &[], &["out.fbx", ".spz", "found .fbx"]);
     refused(&folder.path().join("missing.glb"), &output, &[], &["missing.glb", "No such file"]);
     refused(&source, &output, &["--frame", "x-up"], &["expected z-up, y-up or y-down"]);
-    for extension in ["ply", "splat", "spz", "sog", "glb", "html"] {
+    for extension in ["ply", "splat", "spz", "sog", "glb", "usda", "usdz", "html"] {
         let broken = folder.path().join(format!("broken.{extension}"));
         fs::write(&broken, "nothing of the kind").unwrap();
         refused(&broken, &output, &[], &[&format!("broken.{extension}"), "expected", "found"]);
@@ -86,7 +86,55 @@ fn what_cannot_be_converted_is_refused() {
     let empty = folder.path().join("empty.splat");
     fs::write(&empty, "").unwrap();
     refused(&empty, &output, &[], &["at least one Gaussian"]);
-    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 8);
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 10);
+}
+
+#[test]
+fn convert_merges_crops_cleans_and_scales() {
+    let (folder, source, cloud) = object();
+    let output = folder.path().join("out.ply");
+    let run = |more: &[&str]| {
+        let done = freerange(&[&["convert", text(&source), text(&source), text(&output)], more].concat());
+        (
+            done.status.code(),
+            String::from_utf8_lossy(&done.stderr).into_owned(),
+            read(&output, Frame::Z_UP).map(|l| l.splats.cloud),
+        )
+    };
+    let (code, _, found) = run(&[]);
+    assert_eq!((code, found.unwrap().len()), (Some(0), 20));
+    let low = (0..10).map(|i| cloud.mean(i).x).fold(f64::INFINITY, f64::min);
+    let (_, said, found) = run(&["--box", &format!("{},-9,-9:9,9,9", low + 1e-4)]);
+    assert!(found.unwrap().len() < 20 && said.contains("are in the box"), "{said}");
+    let (_, said, found) = run(&["--sphere", "0,0,0:100", "--measure", "0,0,-1:0,0,1=1"]);
+    let found = found.unwrap();
+    assert!(said.contains("20 of 20 Gaussians are in the sphere") && said.contains("scaled by 0.5"), "{said}");
+    assert!((0..10).all(|i| (found.mean(i) - 0.5 * cloud.mean(i)).length() < 1e-6));
+    for (option, value, words) in [
+        ("--box", "1,2:3,4,5", "expected a point X,Y,Z"),
+        ("--box", "5,5,5:6,6,6", "expected Gaussians in the box, found none of 20"),
+        ("--sphere", "0,0,0:-1", "expected a length above 0"),
+        ("--measure", "1,1,1:1,1,1=2", "expected two different points"),
+        ("--voxels", "20", "--mesh"),
+    ] {
+        let (code, said, _) = run(&[option, value]);
+        assert!(code == Some(2) && said.contains(words), "{option} {value}: {said}");
+    }
+}
+
+#[test]
+fn convert_makes_meshes() {
+    let folder = tempfile::tempdir().unwrap();
+    let bowl = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/golden/formats/source.ply");
+    for name in ["m.glb", "m.ply", "m.obj"] {
+        let path = folder.path().join(name);
+        let done = freerange(&["convert", text(&bowl), text(&path), "--mesh", "--voxels", "40"]);
+        assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+        assert!(String::from_utf8_lossy(&done.stdout).contains("triangles)") && path.metadata().unwrap().len() > 1000);
+    }
+    let done = freerange(&["convert", text(&bowl), "m.spz", "--mesh"]);
+    let said = String::from_utf8_lossy(&done.stderr).into_owned();
+    assert!(done.status.code() == Some(2) && said.contains("expected .glb, .ply or .obj, found .spz"), "{said}");
 }
 
 #[test]
@@ -111,9 +159,9 @@ fn reconstruct_writes_the_formats_asked_for() {
         "glb,spz,html,ply",
     ]);
     assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
-    let cloud = read(&output.join("gaussians.ply"), Frame::Z_UP).unwrap().cloud;
+    let cloud = read(&output.join("gaussians.ply"), Frame::Z_UP).unwrap().splats.cloud;
     for name in ["gaussians.glb", "gaussians.spz", "view.html"] {
-        let found = read(&output.join(name), Frame::Z_UP).unwrap().cloud;
+        let found = read(&output.join(name), Frame::Z_UP).unwrap().splats.cloud;
         let apart = (0..cloud.len()).map(|i| (found.mean(i) - cloud.mean(i)).length()).fold(0.0, f64::max);
         assert!(found.len() == cloud.len() && apart < 1e-4, "{name}: {apart}");
     }
@@ -123,9 +171,11 @@ fn reconstruct_writes_the_formats_asked_for() {
     let done = freerange(&["render", text(&output.join("gaussians.glb")), "--cameras", &cameras, "-o", text(&renders)]);
     assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
     assert!(fs::read_dir(renders).unwrap().count() > 1);
-    let done = freerange(&["reconstruct", &scene, "-o", text(&output), "--format", "usdz"]);
+    let done = freerange(&["reconstruct", &scene, "-o", text(&output), "--format", "fbx"]);
     assert_eq!(done.status.code(), Some(2));
-    assert!(String::from_utf8_lossy(&done.stderr).contains("expected one of ply, splat, spz, sog, glb, html"));
+    assert!(
+        String::from_utf8_lossy(&done.stderr).contains("expected one of ply, splat, spz, sog, glb, usda, usdz, html")
+    );
 }
 
 #[test]

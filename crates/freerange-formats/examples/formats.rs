@@ -22,16 +22,16 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut arguments = std::env::args_os().skip(1).map(PathBuf::from);
     let input = arguments.next().ok_or("expected a file of Gaussians")?;
     let folder = arguments.next();
-    let cloud = read(&input, Frame::Z_UP)?.cloud;
-    println!("{}: {} Gaussians\n", input.display(), cloud.len());
+    let splats = read(&input, Frame::Z_UP)?.splats;
+    println!("{}: {} Gaussians\n", input.display(), splats.cloud.len());
     println!("| format | bytes | per Gaussian | write ms | read ms |\n|---|---|---|---|---|");
     let all = Format::ALL.map(|f| (f, SpzVersion::V3, format!(".{f}")));
     for (format, spz_version, name) in all.into_iter().chain([(Format::Spz, SpzVersion::V4, ".spz version 4".into())]) {
         let options = WriteOptions { spz_version, ..WriteOptions::default() };
-        let bytes = encode(&cloud, format, &options)?.bytes;
-        let written = fastest(|| encode(&cloud, format, &options));
+        let bytes = encode(&splats, format, &options)?.bytes;
+        let written = fastest(|| encode(&splats, format, &options));
         let loaded = fastest(|| parse(format, &bytes, &input, Frame::Z_UP));
-        let each = bytes.len() as f64 / cloud.len() as f64;
+        let each = bytes.len() as f64 / splats.cloud.len() as f64;
         println!("| {name} | {} | {each:.1} | {written:.2} | {loaded:.2} |", bytes.len());
         if let Some(folder) = &folder {
             let name =

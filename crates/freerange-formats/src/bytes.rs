@@ -1,5 +1,11 @@
 //! Taking bytes apart without believing what they claim.
 
+use std::{
+    fs::File,
+    io::Read,
+    path::{Component, Path, PathBuf},
+};
+
 use freerange_core::Invalid;
 
 use crate::error::problem;
@@ -40,5 +46,34 @@ impl<'a> Cursor<'a> {
 
     pub fn u64(&mut self, field: &str) -> Result<u64, Invalid> {
         Ok(u64::from_le_bytes(self.take(field, 8)?.try_into().expect("eight bytes")))
+    }
+}
+
+/// Where files lie that another one names.
+pub enum Beside {
+    /// Nowhere: the file came without a folder.
+    Nothing,
+    /// In this folder.
+    Folder(PathBuf),
+}
+
+impl Beside {
+    /// The file `name`, a relative path that does not leave the folder, of at most `limit` bytes.
+    pub fn file(&self, name: &str, limit: u64) -> Result<Vec<u8>, Invalid> {
+        let shown: String = name.chars().take(60).collect();
+        let Self::Folder(folder) = self else {
+            return Err(problem(&*shown, "all data in the file itself", "the name of another file"));
+        };
+        let within = |c: Component| matches!(c, Component::Normal(_) | Component::CurDir);
+        if name.is_empty() || !Path::new(name).components().all(within) {
+            return Err(problem(&*shown, "the name of a file in the same folder", "another path"));
+        }
+        let mut bytes = Vec::new();
+        let opened = File::open(folder.join(name)).and_then(|f| f.take(limit + 1).read_to_end(&mut bytes));
+        opened.map_err(|e| problem(&*shown, "a file in the same folder", e))?;
+        if bytes.len() as u64 > limit {
+            return Err(problem(&*shown, format!("at most {limit} bytes"), "more"));
+        }
+        Ok(bytes)
     }
 }

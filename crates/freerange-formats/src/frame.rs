@@ -27,6 +27,11 @@ impl Frame {
         Some(if opposite { Self::Y_DOWN } else { Self { y_up: DQuat::from_rotation_arc(up, DVec3::Y) } })
     }
 
+    /// The frame that `turn` takes to the one with +y up.
+    pub(crate) fn turned_to_y_up(turn: DQuat) -> Self {
+        Self { y_up: turn }
+    }
+
     /// The direction of up.
     pub fn up(self) -> DVec3 {
         self.y_up.inverse() * DVec3::Y
@@ -53,6 +58,42 @@ impl std::str::FromStr for Frame {
             "y-up" => Ok(Self::Y_UP),
             "y-down" => Ok(Self::Y_DOWN),
             _ => Err("expected z-up, y-up or y-down".into()),
+        }
+    }
+}
+
+/// From which frame to which files are turned when they are read.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Frames {
+    /// The frame of the file's numbers, whatever the file or its format says of them; none: what they say.
+    pub from: Option<Frame>,
+    /// The frame that Gaussians are turned to. A file that fixes no frame and for which there is no `from` is in it
+    /// already. None: that of such a file, else +z up.
+    pub to: Option<Frame>,
+}
+
+impl Frames {
+    /// The frame of the file, which fixes `fixed` or none, and the frame of the result.
+    pub(crate) fn resolve(self, fixed: Option<Frame>) -> (Frame, Frame) {
+        let to = self.to.unwrap_or_default();
+        (self.from.or(fixed).unwrap_or(to), to)
+    }
+}
+
+impl From<Frame> for Frames {
+    fn from(to: Frame) -> Self {
+        Self { from: None, to: Some(to) }
+    }
+}
+
+impl std::str::FromStr for Frames {
+    type Err = String;
+
+    /// `FRAME` or `FROM:TO`.
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        match text.split_once(':') {
+            Some((from, to)) => Ok(Self { from: Some(from.parse()?), to: Some(to.parse()?) }),
+            None => Ok(text.parse::<Frame>()?.into()),
         }
     }
 }

@@ -2,15 +2,17 @@
 //!
 //! One node, whose rotation takes the user's frame to glTF's (+y up), with a mesh of one primitive of points.
 //! Attributes are in the user's frame: `POSITION`, `KHR_gaussian_splatting:ROTATION` (`x y z w`), `:SCALE` (standard
-//! deviations), `:OPACITY`, `:SH_DEGREE_0_COEF_0`, and `COLOR_0` (linear, with opacity) for viewers that show points
-//! only. Source: the Khronos registry of extensions.
+//! deviations), `:OPACITY`, `:SH_DEGREE_0_COEF_0` and those above, and `COLOR_0` (linear, with opacity) for viewers that
+//! show points only. Where positions are relative to an origin far away, the node's translation (of 64 bits) is it.
+//! Source: the Khronos registry of extensions.
 
-use freerange_splat::{Cloud, channel};
+use freerange_splat::{Cloud, Splats, channel, coefficients};
+use glam::DVec3;
 use serde_json::{Value, json};
 
 use crate::{
     Encoded, Frame,
-    quantize::{sh_of_color, unorm8},
+    quantize::{linear, sh_of_color, unorm8},
 };
 
 /// The extension's name, and what its attributes' names begin with.
@@ -23,7 +25,8 @@ pub const BINARY: u32 = 0x004e_4942;
 pub const FLOAT: u32 = 5126;
 pub const UNSIGNED_BYTE: u32 = 5121;
 
-pub fn encode(cloud: &Cloud, frame: Frame) -> Encoded {
+pub fn encode(splats: &Splats, frame: Frame) -> Encoded {
+    let cloud = &splats.cloud;
     let mut file = Builder { cloud, binary: Vec::new(), views: Vec::new(), accessors: Vec::new() };
     let f32s = |values: &[f32]| values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
     let largest = f64::from(f32::MAX);
@@ -41,7 +44,7 @@ pub fn encode(cloud: &Cloud, frame: Frame) -> Encoded {
     file.accessors[position]["min"] = json!([0, 1, 2].map(|c| column(c).fold(f32::INFINITY, f32::min)));
     file.accessors[position]["max"] = json!([0, 1, 2].map(|c| column(c).fold(f32::NEG_INFINITY, f32::max)));
 
-    let attributes = json!({
+    let mut attributes = json!({
         "POSITION": position,
         "COLOR_0": color,
         "KHR_gaussian_splatting:ROTATION": rotation,
@@ -49,13 +52,25 @@ pub fn encode(cloud: &Cloud, frame: Frame) -> Encoded {
         "KHR_gaussian_splatting:OPACITY": opacity,
         "KHR_gaussian_splatting:SH_DEGREE_0_COEF_0": harmonic,
     });
+    for l in 1..=splats.harmonics.degree() {
+        for m in 0..2 * l + 1 {
+            let at = 3 * (coefficients(l - 1) + m);
+            let name = format!("{EXTENSION}:SH_DEGREE_{l}_COEF_{m}");
+            attributes[name] = file.attribute("VEC3", FLOAT, |i| f32s(&splats.harmonics.row(i)[at..at + 3])).into();
+        }
+    }
+    let turn = frame.to(Frame::Y_UP);
+    let mut node = json!({ "mesh": 0, "rotation": turn.to_array() });
+    if splats.origin != DVec3::ZERO {
+        node["translation"] = json!((turn * splats.origin).to_array());
+    }
     let splatting = json!({ EXTENSION: { "kernel": "ellipse", "colorSpace": "srgb_rec709_display" } });
     let json = json!({
         "asset": { "version": "2.0", "generator": concat!("free-range ", env!("CARGO_PKG_VERSION")) },
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{ "nodes": [0] }],
-        "nodes": [{ "mesh": 0, "rotation": frame.to(Frame::Y_UP).to_array() }],
+        "nodes": [node],
         "meshes": [{ "primitives": [{ "mode": 0, "attributes": attributes, "extensions": splatting }] }],
         "accessors": file.accessors,
         "bufferViews": file.views,
@@ -104,9 +119,4 @@ impl Builder<'_> {
         self.accessors.push(accessor);
         view
     }
-}
-
-/// sRGB's curve, taken back.
-fn linear(encoded: f64) -> f64 {
-    if encoded <= 0.04045 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) }
 }

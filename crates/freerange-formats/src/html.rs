@@ -8,7 +8,7 @@ use freerange_core::Invalid;
 use freerange_splat::{Cloud, channel};
 use sha2::{Digest, Sha256};
 
-use crate::{Encoded, Frame, Loaded, error::problem, quantize::Row};
+use crate::{Decoded, Encoded, Frame, error::problem, quantize::Row};
 
 const PAGE: &str = include_str!("viewer/page.html");
 const STYLE: &str = include_str!("viewer/style.css");
@@ -49,7 +49,7 @@ pub fn encode(cloud: &Cloud, frame: Frame) -> Encoded {
     Encoded { bytes: page.into_bytes(), notes: Vec::new() }
 }
 
-pub fn decode(bytes: &[u8]) -> Result<Loaded, Invalid> {
+pub fn decode(bytes: &[u8]) -> Result<Decoded, Invalid> {
     let wrong = |expected: &'static str, found: &dyn std::fmt::Display| problem("Gaussians", expected, found);
     let page = std::str::from_utf8(bytes).map_err(|e| problem("page", "UTF-8", e))?;
     let data =
@@ -63,5 +63,5 @@ pub fn decode(bytes: &[u8]) -> Result<Loaded, Invalid> {
     }
     let values = data.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect::<Vec<_>>();
     debug_assert!(values.len().is_multiple_of(channel::COUNT));
-    Ok(Loaded { cloud: Cloud::from_rows(values), notes: Vec::new() })
+    Ok(Decoded { splats: Cloud::from_rows(values).into(), ..Decoded::default() })
 }

@@ -1,6 +1,6 @@
 //! Numbers in few bits, as several formats have them.
 
-use freerange_splat::channel;
+use freerange_splat::{SCALE_OF_NONE, channel};
 use glam::DQuat;
 
 /// The constant real spherical harmonic, 1 / (2 sqrt(pi)).
@@ -34,19 +34,29 @@ pub fn logit(opacity: f64) -> f32 {
 /// Smallest standard deviation; zero has no logarithm.
 const MIN_SCALE: f64 = 4.3e-18; // ln is -40
 
-/// The logarithm of a standard deviation that is not negative.
+/// The logarithm of a standard deviation that is not negative; what is not finite stays so.
 pub fn log_scale(scale: f64) -> f32 {
-    if scale < MIN_SCALE { -40.0 } else { scale.ln() as f32 }
+    if scale < MIN_SCALE { SCALE_OF_NONE } else { scale.ln() as f32 }
 }
 
-/// Colour as the coefficient of the constant spherical harmonic.
+/// Color as the coefficient of the constant spherical harmonic.
 pub fn sh_of_color(color: f32) -> f64 {
     (f64::from(color) - 0.5) / SH_C0
 }
 
-/// Colour of the coefficient of the constant spherical harmonic.
+/// Color of the coefficient of the constant spherical harmonic.
 pub fn color_of_sh(coefficient: f64) -> f32 {
     (coefficient * SH_C0 + 0.5) as f32
+}
+
+/// sRGB's curve, taken back.
+pub fn linear(encoded: f64) -> f64 {
+    if encoded <= 0.04045 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) }
+}
+
+/// sRGB's curve.
+pub fn encoded(linear: f64) -> f64 {
+    if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
 }
 
 /// The largest of four by magnitude and its number, the first of equals; then the others in order, with the sign that

@@ -1,13 +1,13 @@
 //! `.splat`: 32 bytes per Gaussian, in the user's frame, those that show most first.
 //!
-//! Position `f32 x 3`, standard deviations `f32 x 3`, colour and opacity `u8 x 4`, rotation `w x y z` as `u8 x 4`
+//! Position `f32 x 3`, standard deviations `f32 x 3`, color and opacity `u8 x 4`, rotation `w x y z` as `u8 x 4`
 //! around 128. The layout is that of the viewer by Kwok (github.com/antimatter15/splat), which has no other document.
 
 use freerange_core::Invalid;
 use freerange_splat::{Cloud, channel};
 
 use crate::{
-    Encoded, Loaded,
+    Decoded, Encoded,
     error::problem,
     quantize::{Row, byte, log_scale, logit_of_byte, set_rotation, unorm8},
 };
@@ -33,10 +33,10 @@ pub fn encode(cloud: &Cloud) -> Encoded {
         bytes.push(unorm8(cloud.opacity(i)));
         bytes.extend([q.w, q.x, q.y, q.z].map(|v| byte(v * 128.0 + 128.0)));
     }
-    Encoded { bytes, notes: clip_note(clipped, "colours beyond 0..1") }
+    Encoded { bytes, notes: clip_note(clipped, "colors beyond 0..1") }
 }
 
-pub fn decode(bytes: &[u8]) -> Result<Loaded, Invalid> {
+pub fn decode(bytes: &[u8]) -> Result<Decoded, Invalid> {
     let (rows, rest) = bytes.as_chunks::<BYTES>();
     if !rest.is_empty() {
         return Err(problem("length", "a multiple of 32 bytes", bytes.len()));
@@ -49,7 +49,7 @@ pub fn decode(bytes: &[u8]) -> Result<Loaded, Invalid> {
         for k in 0..3 {
             row[k] = float(k);
             let scale = f64::from(float(3 + k));
-            if !(scale >= 0.0 && scale.is_finite()) {
+            if scale < 0.0 {
                 return Err(problem(format!("Gaussian {i}, scale {k}"), "a number, at least 0", scale));
             }
             row[channel::LOG_SCALE.start + k] = log_scale(scale);
@@ -59,7 +59,7 @@ pub fn decode(bytes: &[u8]) -> Result<Loaded, Invalid> {
         set_rotation(&mut row, [4, 5, 6, 7].map(|k| (f64::from(small[k]) - 128.0) / 128.0));
         cloud.extend(row);
     }
-    Ok(Loaded { cloud: Cloud::from_rows(cloud), notes: Vec::new() })
+    Ok(Decoded { splats: Cloud::from_rows(cloud).into(), ..Decoded::default() })
 }
 
 /// A sentence for the user if anything was clipped.

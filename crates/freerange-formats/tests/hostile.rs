@@ -12,8 +12,8 @@ use proptest::prelude::*;
 fn try_all(format: Format, bytes: &[u8]) -> Result<usize, String> {
     match parse(format, bytes, Path::new("broken.file"), Frame::Z_UP) {
         Ok(loaded) => {
-            assert!(loaded.cloud.check_finite().is_ok());
-            Ok(loaded.cloud.len())
+            assert!(loaded.splats.cloud.check_finite().is_ok());
+            Ok(loaded.splats.cloud.len())
         }
         Err(e) => {
             let message = e.to_string();
@@ -27,7 +27,7 @@ fn try_all(format: Format, bytes: &[u8]) -> Result<usize, String> {
 }
 
 fn example(format: Format, version: SpzVersion) -> Vec<u8> {
-    encode(&object(9), format, &WriteOptions { spz_version: version, ..WriteOptions::default() }).unwrap().bytes
+    encode(&object(9).into(), format, &WriteOptions { spz_version: version, ..WriteOptions::default() }).unwrap().bytes
 }
 
 fn gzip(bytes: &[u8]) -> Vec<u8> {
@@ -50,13 +50,19 @@ fn has(message: &str, words: &[&str]) {
 #[test]
 fn splat_files() {
     has(&refused(Format::Splat, |b| b.truncate(100)), &["length", "multiple of 32", "100"]);
+    has(&refused(Format::Splat, |b| b[44..48].copy_from_slice(&(-1f32).to_le_bytes())), &["Gaussian 1, scale 0", "-1"]);
+    // What is not finite is left out; where there is nothing else, the file is refused.
+    for (at, value) in [(44, f32::NAN), (0, f32::INFINITY), (12, f32::INFINITY)] {
+        let mut bytes = example(Format::Splat, SpzVersion::V3);
+        bytes[at..at + 4].copy_from_slice(&value.to_le_bytes());
+        let loaded = parse(Format::Splat, &bytes, Path::new("a"), Frame::Z_UP).unwrap();
+        assert_eq!(loaded.splats.cloud.len(), 8);
+        assert!(loaded.notes[0].starts_with("1 Gaussians with numbers that are not finite"), "{:?}", loaded.notes);
+    }
+    let nothing = f32::NAN.to_le_bytes().repeat(8);
     has(
-        &refused(Format::Splat, |b| b[44..48].copy_from_slice(&f32::NAN.to_le_bytes())),
-        &["Gaussian 1, scale 0", "NaN"],
-    );
-    has(
-        &refused(Format::Splat, |b| b[..4].copy_from_slice(&f32::INFINITY.to_le_bytes())),
-        &["Gaussian 0, mean x", "inf"],
+        &try_all(Format::Splat, &nothing).unwrap_err(),
+        &["Gaussians", "at least one of finite numbers", "1 of others"],
     );
     assert_eq!(try_all(Format::Splat, &[]), Ok(0));
 }
@@ -70,7 +76,7 @@ fn spz_files() {
     has(&spz(b""), &["header", "4 bytes"]);
     has(&spz(b"glTF, or so"), &["header", "\"NGSP\"", "glTF"]);
     has(&spz(&gzip(b"NGSP")), &["version", "0 and the end"]);
-    has(&spz(&gzip(&header(1, 1, 0, 12))), &["version", "2, 3 or 4", "found 1"]);
+    has(&spz(&gzip(&header(5, 1, 0, 12))), &["version", "1, 2, 3 or 4", "found 5"]);
     has(&spz(&gzip(&header(4, 1, 0, 12))), &["version", "gzip"]);
     has(&spz(&header(3, 1, 0, 12)), &["version", "outside of a gzip"]);
     has(&spz(&gzip(&header(3, u32::MAX, 0, 12))), &["count of Gaussians", "at most", "4294967295"]);
@@ -137,7 +143,7 @@ fn glb_files() {
     has(&refused(Format::Glb, |b| b[4] = 1), &["version", "found 1"]);
     has(&refused(Format::Glb, |b| b.truncate(500)), &["length", "500"]);
     has(&refused(Format::Glb, |b| b[12..16].fill(255)), &["chunk"]);
-    has(&glb("{\"nodes\":3}"), &["JSON chunk"]);
+    has(&glb("{\"nodes\":3}"), &["JSON"]);
     has(&glb("{\"extensionsRequired\":[\"KHR_draco_mesh_compression\"]}"), &["extensionsRequired", "draco"]);
     has(&glb("{}"), &["scene", "0 of 0"]);
     has(&glb("{\"scenes\":[{\"nodes\":[0]}],\"nodes\":[{\"children\":[0]}]}"), &["node 0", "circle"]);
@@ -155,12 +161,53 @@ fn glb_files() {
         })
     };
     has(&edited("\"ellipse\"", "\"circle_\""), &["kernel", "ellipse", "circle_"]);
-    has(&edited("srgb_rec709_display", "lin__rec709_display"), &["colorSpace", "lin__rec709"]);
+    has(&edited("srgb_rec709_display", "lim__rec709_display"), &["colorSpace", "lim__rec709"]);
     has(&edited("\"mode\":0", "\"mode\":4"), &["mode", "0 (points)", "4"]);
     has(&edited("_splatting:SCALE", "_splatting:SCALD"), &["SCALE", "no such attribute"]);
     has(&edited("\"count\":9", "\"count\":8"), &["count"]);
     has(&edited("\"type\":\"SCALAR\"", "\"type\":\"SCALA_\""), &["OPACITY", "SCALAR"]);
     has(&edited("\"byteLength\":108", "\"byteLength\":107"), &["beyond its end"]);
+}
+
+#[test]
+fn stages() {
+    let usd = |bytes: &[u8]| try_all(Format::Usda, bytes).unwrap_err();
+    has(&usd(b"nothing of the kind"), &["layer", "text layer"]);
+    has(&usd(&[0xff, 0xfe]), &["layer", "UTF-8"]);
+    has(&usd(b"PXR-USDC and no more"), &["layer", "binary layer"]);
+    has(&usd(b"PK and no more"), &["archive", ".usdz"]);
+    has(&usd(b"#usda 1.0\n"), &["stage", "ParticleField3DGaussianSplat", "none"]);
+    // Changes to the text of a good file.
+    let edited = |from: &str, to: &str| {
+        let text = String::from_utf8(example(Format::Usda, SpzVersion::V3)).unwrap();
+        assert!(text.contains(from), "{from}");
+        usd(text.replacen(from, to, 1).as_bytes())
+    };
+    has(&edited("upAxis = \"Z\"", "upAxis = \"X\""), &["upAxis", "\"Y\" or \"Z\"", "X"]);
+    has(&edited("float[] opacities = [", "float[] opacities = [0.5, "), &["opacities", "9 values", "found 10"]);
+    has(&edited("float[] opacities = [", "float[] opacitie = ["), &["opacities", "its values", "none"]);
+    has(
+        &edited("quatf[] orientations = [(", "quatf[] orientations = [(0, 0, 0, 0), ("),
+        &["orientations", "9 values", "10"],
+    );
+    has(&edited("float3[] scales = [", "float3[] scales = [(1, 1, 1), "), &["scales", "9 values", "10"]);
+    has(&edited("sphericalHarmonicsDegree = 0", "sphericalHarmonicsDegree = 1"), &["4 values (degree 1)", "found 9"]);
+    has(&edited("sphericalHarmonicsDegree = 0", "sphericalHarmonicsDegree = -1"), &["Degree", "0 to 8"]);
+    has(&edited("uniform int radiance:sphericalHarmonicsDegree = 0", ""), &["16 values (degree 3)", "found 9"]);
+    let first = |name: &str, value: &str| {
+        let text = String::from_utf8(example(Format::Usda, SpzVersion::V3)).unwrap();
+        let at = text.find(&format!("{name} = [")).unwrap() + name.len() + 4;
+        let end = at + text[at..].find(if name.contains("opacities") { "," } else { ")" }).unwrap();
+        let end = if name.contains("opacities") { end } else { end + 1 };
+        format!("{}{value}{}", &text[..at], &text[end..])
+    };
+    has(&usd(first("float[] opacities", "1.5").as_bytes()), &["opacities, element 0", "0 to 1", "1.5"]);
+    has(&usd(first("float3[] scales", "(1, -1, 1)").as_bytes()), &["scales, element 0", "at least 0", "-1"]);
+    has(&usd(first("quatf[] orientations", "(0, 0, 0, 0)").as_bytes()), &["orientations, element 0", "unit length"]);
+    let stretched = "double3 xformOp:scale = (1, 2, 1)\n    uniform token[] xformOpOrder = [\"xformOp:scale\"]\n    uniform token s";
+    has(&edited("uniform token s", stretched), &["xformOpOrder", "same positive scale"]);
+    let unknown = "double xformOp:spin = 3\n    uniform token[] xformOpOrder = [\"xformOp:spin\"]\n    uniform token s";
+    has(&edited("uniform token s", unknown), &["xformOpOrder", "translate, scale", "xformOp:spin"]);
 }
 
 #[test]

@@ -22,6 +22,7 @@ mod cpu;
 mod error;
 #[cfg(feature = "gpu")]
 mod gpu;
+mod mip;
 #[cfg(feature = "op")]
 mod op;
 pub mod reference;
@@ -29,6 +30,7 @@ pub mod reference;
 pub use config::RasterConfig;
 pub use cpu::{Gradients, RenderOutput, render, render_backward};
 pub use error::RasterError;
+pub use mip::{MIP_BLUR, mip_compensated};
 #[cfg(feature = "op")]
 pub use op::rasterize;
 

@@ -72,9 +72,9 @@ fn the_example_becomes_gaussians_while_one_watches() {
         assert_eq!(reply.headers["content-disposition"], format!("attachment; filename=\"bowl-1.{format}\""));
         let name = format!("x.{format}");
         let read = parse(format, &reply.body, name.as_ref(), Frame::Z_UP).unwrap();
-        assert_eq!(read.cloud.len(), 40, "{format}");
+        assert_eq!(read.splats.cloud.len(), 40, "{format}");
         if format == Format::Ply {
-            assert!(alike(read.cloud.rows()));
+            assert!(alike(read.splats.cloud.rows()));
         }
     }
     for (path, size) in [("thumbnail.png", (160, 160)), ("photos/0.png", (512, 512)), ("views/3.png", (512, 512))] {

@@ -4,20 +4,26 @@
 
 mod align;
 mod cloud;
+mod edit;
 mod eigen;
 mod error;
+mod harmonics;
 mod merge;
 mod normalize;
 pub mod patch;
 mod ply;
+mod ply_columns;
 mod ply_compressed;
 mod ply_header;
+mod splats;
 mod tree;
 
 pub use align::Alignment;
 pub use cloud::{Cloud, channel};
 pub use error::SplatError;
+pub use harmonics::{Harmonics, MAX_DEGREE, coefficients};
 pub use merge::{Gaussian, OPACITY_RANGE, merge};
 pub use normalize::{Normalization, STD_FLOOR, Statistics};
-pub use ply::{PlyFile, encode_ply, parse_ply, read_ply, write_ply};
+pub use ply::{PlyFile, SCALE_OF_NONE, encode_ply, encode_splats, parse_ply, read_ply, write_ply};
+pub use splats::{RenderMode, Splats};
 pub use tree::{LodTree, Node};

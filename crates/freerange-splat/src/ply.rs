@@ -1,29 +1,26 @@
 //! The `.ply` files that 3D Gaussian splatting tools exchange.
 //!
-//! Written: binary little endian, `x y z nx ny nz f_dc_0..2 opacity scale_0..2 rot_0..3`, all float; `f_dc` is the
-//! colour as the constant term of spherical harmonics, `opacity` a logit, `scale` a logarithm, `rot` a quaternion wxyz.
-//! Read: any order of properties, further properties and elements, ascii and both byte orders, and the compressed form
-//! of PlayCanvas. Headers are not trusted: memory grows with the rows that arrive.
+//! Written: binary little endian, `x y z nx ny nz f_dc_0..2 f_rest_.. opacity scale_0..2 rot_0..3`, all float; `f_dc` is
+//! the color as the constant term of spherical harmonics, `f_rest` the others (all of red, then green, then blue),
+//! `opacity` a logit, `scale` a logarithm, `rot` a quaternion wxyz.
+//! Read: any order of properties, further properties and elements, ascii and both byte orders, colors as bytes, files
+//! of 2D Gaussians, and the compressed form of PlayCanvas. Gaussians that are not finite are left out. Headers are not
+//! trusted: memory grows with the rows that arrive.
 
-use crate::cloud::Row;
+use crate::ply_columns::{Column, Plan};
 use crate::ply_compressed;
-use crate::ply_header::{Element, Format, Header, Kind, Property, Scalar, read_header};
-use crate::{Cloud, SplatError, channel};
+use crate::ply_header::{Element, Format, Kind, Property, Scalar, read_header};
+use crate::{Cloud, Harmonics, RenderMode, SplatError, Splats, channel, coefficients};
 use freerange_core::{IoError, write_atomically};
+use glam::DVec3;
 use std::io::{self, BufRead, BufReader, Read, Write};
 use std::{fs::File, path::Path};
 
 /// The constant real spherical harmonic, 1 / (2 sqrt(pi)).
-const SH_C0: f64 = 0.282_094_791_773_878_14;
-
-/// The property that each channel is stored in.
-const PROPERTIES: [&str; channel::COUNT] = [
-    "x", "y", "z", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "opacity", "f_dc_0", "f_dc_1",
-    "f_dc_2",
-];
+pub(crate) const SH_C0: f64 = 0.282_094_791_773_878_14;
 
 /// Columns of the files we write: a channel, or a zero (the normal that nobody uses).
-const COLUMNS: [(&str, Option<usize>); 17] = [
+pub(crate) const COLUMNS: [(&str, Option<usize>); 17] = [
     ("x", Some(0)),
     ("y", Some(1)),
     ("z", Some(2)),
@@ -43,11 +40,18 @@ const COLUMNS: [(&str, Option<usize>); 17] = [
     ("rot_3", Some(9)),
 ];
 
+/// The log-scale of a standard deviation of zero, which has no logarithm.
+pub const SCALE_OF_NONE: f32 = -40.0;
+/// The logit of an opacity of 1, which has none either: that of the number of 32 bits next to it.
+const LOGIT_OF_ONE: f32 = 16.118_095;
+
 /// What a `.ply` holds.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PlyFile {
     /// The Gaussians; all channels finite.
-    pub cloud: Cloud,
+    pub splats: Splats,
+    /// Which way is up, where the file says so.
+    pub up: Option<DVec3>,
     /// What was left out or looks odd, one sentence each, for the user.
     pub notes: Vec<String>,
 }
@@ -56,7 +60,7 @@ pub struct PlyFile {
 ///
 /// # Errors
 /// [`SplatError::Io`]; [`SplatError::PlyHeader`], [`SplatError::PlyProperty`] and [`SplatError::PlyValue`] where the
-/// file is no `.ply`, does not hold Gaussians, ends early, or holds a value that is not finite.
+/// file is no `.ply`, does not hold Gaussians, ends early, or holds none that is finite.
 pub fn read_ply(file: &Path) -> Result<PlyFile, SplatError> {
     let opened = File::open(file).map_err(IoError::at(file))?;
     parse_ply(BufReader::with_capacity(1 << 18, opened), file)
@@ -76,36 +80,114 @@ pub fn parse_ply(mut reader: impl BufRead, file: &Path) -> Result<PlyFile, Splat
     if ply_compressed::is_compressed(&header.elements[at]) {
         return ply_compressed::read(values, &header, at);
     }
-    let channel_of = columns(&header.elements[at], file)?;
-    let mut notes = notes(&header, at);
-
+    let vertex = &header.elements[at];
+    let plan = Plan::new(vertex, header.comments.mode, file)?;
+    let mut notes = plan.notes(&header, at);
     for element in &header.elements[..at] {
         values.rows(element, |_, _, _| Ok(()))?;
     }
-    let vertex = &header.elements[at];
-    // The count may lie: rows beyond the first few are allocated as they arrive.
-    let mut data = Vec::with_capacity(vertex.count.min(1 << 16) as usize * channel::COUNT);
-    let mut row = Row::default();
-    values.rows(vertex, |i, column, value| {
-        if let Some(c) = channel_of[column] {
-            let value = if channel::COLOR.contains(&c) { value * SH_C0 + 0.5 } else { value };
-            row[c] = value as f32;
-            if !row[c].is_finite() {
-                let name = &vertex.properties[column].name;
-                return Err(value_error(file, vertex, i, name, "a finite number", &row[c].to_string()));
-            }
-        }
-        if column + 1 == channel_of.len() {
-            data.extend_from_slice(&row);
-        }
-        Ok(())
-    })?;
-    let cloud = Cloud::from_rows(data);
+    let mut rows = read_rows(&mut values, vertex, &plan)?;
+    let cloud = Cloud::from_rows(std::mem::take(&mut rows.data));
+    if cloud.is_empty() && rows.dropped > 0 {
+        return Err(value_error(file, vertex, 0, "x", "at least one Gaussian of finite numbers", "none"));
+    }
+    notes.extend(rows.notes());
     let zero = cloud.iter().filter(|row| row[channel::ROTATION].iter().all(|v| *v == 0.0)).count();
     if zero > 0 {
         notes.push(format!("{zero} Gaussians have a rotation of length zero, which stands for none"));
     }
-    Ok(PlyFile { cloud, notes })
+    let mut splats = Splats {
+        harmonics: Harmonics::from_rows(plan.degree, rows.harmonics),
+        cloud,
+        mode: plan.mode,
+        origin: header.comments.origin.unwrap_or_default(),
+    };
+    if plan.exact_positions && splats.origin == DVec3::ZERO {
+        splats.place(&rows.positions);
+    }
+    Ok(PlyFile { splats, up: header.comments.up, notes })
+}
+
+/// What the rows of Gaussians hold.
+#[derive(Default)]
+struct Rows {
+    data: Vec<f32>,      // [n, 14]
+    harmonics: Vec<f32>, // [n, coefficients, 3]
+    positions: Vec<DVec3>,
+    /// Gaussians left out, opacities at the ends, deviations of zero.
+    dropped: usize,
+    clamped: usize,
+}
+
+impl Rows {
+    fn notes(&self) -> Vec<String> {
+        let mut notes = Vec::new();
+        if self.dropped > 0 {
+            notes.push(format!("{} Gaussians with numbers that are not finite are left out", self.dropped));
+        }
+        if self.clamped > 0 {
+            notes.push(format!(
+                "{} Gaussians have an infinite opacity or log-scale, taken as the nearest finite one",
+                self.clamped
+            ));
+        }
+        notes
+    }
+}
+
+fn read_rows<R: BufRead>(values: &mut Values<'_, R>, vertex: &Element, plan: &Plan) -> Result<Rows, SplatError> {
+    let width = coefficients(plan.degree);
+    // The count may lie: rows beyond the first few are allocated as they arrive.
+    let mut rows =
+        Rows { data: Vec::with_capacity(vertex.count.min(1 << 16) as usize * channel::COUNT), ..Rows::default() };
+    let mut row = plan.blank();
+    let mut rest = vec![0f32; 3 * width];
+    let (mut position, mut clamped) = (DVec3::ZERO, false);
+    values.rows(vertex, |_, column, value| {
+        match plan.columns[column] {
+            Column::Other => {}
+            Column::Channel(c) => {
+                if channel::MEAN.contains(&c) {
+                    position[c] = value;
+                }
+                let infinite = finite_value(c, value);
+                clamped |= infinite.is_some();
+                row[c] = infinite.unwrap_or(value as f32);
+            }
+            Column::Constant(c) => row[c] = (value * SH_C0 + 0.5) as f32,
+            Column::Color(c, scale) => row[c] = (value * scale) as f32,
+            // Channel by channel in the file.
+            Column::Rest(k) if k % plan.rest_each < width => {
+                rest[3 * (k % plan.rest_each) + k / plan.rest_each] = value as f32;
+            }
+            Column::Rest(_) => {}
+        }
+        if column + 1 == plan.columns.len() {
+            if row.iter().chain(&rest).all(|v| v.is_finite()) {
+                rows.data.extend_from_slice(&row);
+                rows.harmonics.extend_from_slice(&rest);
+                rows.clamped += usize::from(clamped);
+                if plan.exact_positions {
+                    rows.positions.push(position);
+                }
+            } else {
+                rows.dropped += 1;
+            }
+            clamped = false;
+        }
+        Ok(())
+    })?;
+    Ok(rows)
+}
+
+/// What stands for an infinite value of channel `c`, where something does: opacities of 0 and 1, deviations of zero.
+fn finite_value(c: usize, value: f64) -> Option<f32> {
+    match value {
+        f64::INFINITY if c == channel::LOGIT_OPACITY => Some(LOGIT_OF_ONE),
+        f64::NEG_INFINITY if c == channel::LOGIT_OPACITY => Some(-LOGIT_OF_ONE),
+        f64::NEG_INFINITY if channel::LOG_SCALE.contains(&c) => Some(SCALE_OF_NONE),
+        _ => None,
+    }
 }
 
 /// Writes `cloud` to a `.ply` file, first beside it and then renamed. The same cloud gives the same bytes. Reading it
@@ -129,14 +211,51 @@ pub fn encode_ply(cloud: &Cloud) -> Result<Vec<u8>, SplatError> {
     Ok(bytes)
 }
 
+/// `splats` as the bytes of a `.ply`, whose comments say how to draw them, which way is `up`, and what positions are
+/// relative to where that is not zero.
+///
+/// # Errors
+/// [`SplatError::Value`] where a channel is not finite.
+pub fn encode_splats(splats: &Splats, up: DVec3) -> Result<Vec<u8>, SplatError> {
+    splats.cloud.check_finite()?;
+    let mode = match splats.mode {
+        RenderMode::Default => "default",
+        RenderMode::Mip => "mip",
+        RenderMode::Flat => "2dgs",
+    };
+    let up = up.to_array().map(|v| ((v * 1e9).round() / 1e9 + 0.0).to_string()).join(" ");
+    let mut comments = vec![format!("SplatRenderMode: {mode}"), format!("Vertical axis: {up}")];
+    if splats.origin != DVec3::ZERO {
+        comments.push(format!("Origin: {}", splats.origin.to_array().map(|v| v.to_string()).join(" ")));
+    }
+    let mut bytes = Vec::new();
+    write_all(&splats.cloud, &splats.harmonics, &comments, &mut bytes).expect("memory can be written to");
+    Ok(bytes)
+}
+
 fn write_to(cloud: &Cloud, w: &mut impl Write) -> io::Result<()> {
-    write!(w, "ply\nformat binary_little_endian 1.0\nelement vertex {}\n", cloud.len())?;
+    write_all(cloud, &Harmonics::default(), &[], w)
+}
+
+fn write_all(cloud: &Cloud, harmonics: &Harmonics, comments: &[String], w: &mut impl Write) -> io::Result<()> {
+    w.write_all(b"ply\nformat binary_little_endian 1.0\n")?;
+    comments.iter().try_for_each(|text| writeln!(w, "comment {text}"))?;
+    writeln!(w, "element vertex {}", cloud.len())?;
     for (name, _) in COLUMNS {
+        if name == "opacity" {
+            (0..harmonics.width()).try_for_each(|k| writeln!(w, "property float f_rest_{k}"))?;
+        }
         writeln!(w, "property float {name}")?;
     }
     w.write_all(b"end_header\n")?;
-    for row in cloud {
-        for (_, c) in COLUMNS {
+    let each = coefficients(harmonics.degree());
+    for (i, row) in cloud.iter().enumerate() {
+        for (name, c) in COLUMNS {
+            if name == "opacity" {
+                let rest = harmonics.row(i);
+                let by_channel = (0..3).flat_map(|channel| (0..each).map(move |k| rest[3 * k + channel]));
+                by_channel.into_iter().try_for_each(|v| w.write_all(&v.to_le_bytes()))?;
+            }
             let value = match c {
                 None => 0.0,
                 Some(c) if channel::COLOR.contains(&c) => ((f64::from(row[c]) - 0.5) / SH_C0) as f32,
@@ -148,44 +267,8 @@ fn write_to(cloud: &Cloud, w: &mut impl Write) -> io::Result<()> {
     Ok(())
 }
 
-/// Which channel each property of `vertex` fills, if any.
-fn columns(vertex: &Element, file: &Path) -> Result<Vec<Option<usize>>, SplatError> {
-    for (c, name) in PROPERTIES.into_iter().enumerate() {
-        let Some(property) = vertex.properties.iter().find(|p| p.name == name) else {
-            return Err(property_error(file, name, "it, as every file of Gaussians has it", "no such property"));
-        };
-        match property.kind {
-            // Whole numbers can be positions; elsewhere they would be in some other unit.
-            Kind::Single(scalar) if scalar.is_float() || channel::MEAN.contains(&c) => {}
-            Kind::Single(scalar) => return Err(property_error(file, name, "float or double", scalar.name())),
-            Kind::List(..) => return Err(property_error(file, name, "float or double", "a list")),
-        }
-    }
-    Ok(vertex.properties.iter().map(|p| PROPERTIES.iter().position(|name| *name == p.name)).collect())
-}
-
-fn notes(header: &Header, vertex: usize) -> Vec<String> {
-    let is_rest = |name: &str| name.starts_with("f_rest_");
-    let names = || header.elements[vertex].properties.iter().map(|p| p.name.as_str());
-    let mut notes = Vec::new();
-    let rest = names().filter(|name| is_rest(name)).count();
-    if rest > 0 {
-        notes.push(format!("{rest} properties f_rest_* (colour that depends on the viewing direction) are left out"));
-    }
-    let known = |name: &str| COLUMNS.iter().any(|(column, _)| *column == name);
-    let others: Vec<_> = names().filter(|name| !known(name) && !is_rest(name)).collect();
-    if !others.is_empty() {
-        notes.push(format!("properties left out: {}", listed(&others)));
-    }
-    let others: Vec<_> = header.elements.iter().map(|e| e.name.as_str()).filter(|name| *name != "vertex").collect();
-    if !others.is_empty() {
-        notes.push(format!("elements left out: {}", listed(&others)));
-    }
-    notes
-}
-
 /// The first few of `names`; headers may hold thousands.
-fn listed(names: &[&str]) -> String {
+pub(crate) fn listed(names: &[&str]) -> String {
     let shown = names.iter().take(8).map(|n| n.chars().take(40).collect()).collect::<Vec<String>>().join(", ");
     if names.len() > 8 { format!("{shown} and {} more", names.len() - 8) } else { shown }
 }
@@ -282,7 +365,6 @@ impl<R: BufRead> Values<'_, R> {
             return Ok(());
         }
         loop {
-            self.used = 0;
             self.used = 0;
             self.line.clear();
             let read = self.reader.by_ref().take(LINE_LIMIT).read_until(b'\n', &mut self.line);

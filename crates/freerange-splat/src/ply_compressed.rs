@@ -2,13 +2,14 @@
 //!
 //! The element `chunk` has bounds of 256 Gaussians each: of positions, log-scales and, in newer files, colours. The
 //! element `vertex` has four words of 32 bits: position and log-scale in 11, 10 and 11 bits between these bounds;
-//! rotation as the number of the largest of `w x y z` in 2 bits and the others in 10 each; colour and opacity in 8 bits
-//! each.
+//! rotation as the number of the largest of `w x y z` in 2 bits and the others in 10 each; color and opacity in 8 bits
+//! each. The element `sh`, if there is one, has further harmonics, channel by channel, in a byte each.
 
 use crate::cloud::Row;
 use crate::ply::{PlyFile, Values, property_error, value_error};
+use crate::ply_columns::{rest_count, rest_number};
 use crate::ply_header::{Element, Header, Kind, Scalar};
-use crate::{Cloud, SplatError, channel};
+use crate::{Cloud, Harmonics, MAX_DEGREE, SplatError, Splats, channel, coefficients};
 use std::{io::BufRead, path::Path};
 
 /// Gaussians per chunk.
@@ -89,12 +90,74 @@ pub(crate) fn read<R: BufRead>(mut values: Values<'_, R>, header: &Header, at: u
         }
         Ok(())
     })?;
-    let rest = header.elements.iter().find(|e| e.name == "sh").map(|e| e.properties.len());
-    let notes = rest
-        .map(|n| format!("{n} properties f_rest_* (colour that depends on the viewing direction) are left out"))
-        .into_iter()
-        .collect();
-    Ok(PlyFile { cloud: Cloud::from_rows(rows), notes })
+    let (harmonics, notes) = harmonics(&mut values, header, at, vertex.count)?;
+    let splats = Splats {
+        cloud: Cloud::from_rows(rows),
+        harmonics,
+        mode: header.comments.mode.unwrap_or_default(),
+        origin: header.comments.origin.unwrap_or_default(),
+    };
+    Ok(PlyFile { splats, up: header.comments.up, notes })
+}
+
+/// Those of the element `sh` after number `at`, of `count` Gaussians.
+fn harmonics<R: BufRead>(
+    values: &mut Values<'_, R>,
+    header: &Header,
+    at: usize,
+    count: u64,
+) -> Result<(Harmonics, Vec<String>), SplatError> {
+    let Some(offset) = header.elements[at + 1..].iter().position(|e| e.name == "sh") else {
+        return Ok((Harmonics::default(), Vec::new()));
+    };
+    for element in &header.elements[at + 1..][..offset] {
+        values.rows(element, |_, _, _| Ok(()))?;
+    }
+    let element = &header.elements[at + 1 + offset];
+    let bytes = element.properties.iter().all(|p| p.kind == Kind::Single(Scalar::U8));
+    let rest = rest_count(element);
+    if !bytes || rest == 0 || rest != element.properties.len() {
+        let found = format!("{} properties", element.properties.len());
+        return Err(property_error(
+            values.file,
+            "f_rest_0",
+            "an element \"sh\" of 9, 24 or 45 properties uchar",
+            &found,
+        ));
+    }
+    if element.count != count {
+        let expected = format!("{count} rows, as there are Gaussians");
+        return Err(value_error(values.file, element, 0, "f_rest_0", &expected, &element.count.to_string()));
+    }
+    let degree = (1..=MAX_DEGREE).rev().find(|d| 3 * coefficients(*d) <= rest).unwrap_or(1);
+    let (each, width) = (rest / 3, coefficients(degree));
+    let numbers: Vec<usize> = element.properties.iter().filter_map(|p| rest_number(&p.name)).collect();
+    let mut data = Vec::new();
+    let mut row = vec![0f32; 3 * width];
+    values.rows(element, |_, column, value| {
+        let (k, channel) = (numbers[column] % each, numbers[column] / each);
+        if k < width {
+            row[3 * k + channel] = harmonic_of_byte(value);
+        }
+        if column + 1 == numbers.len() {
+            data.extend_from_slice(&row);
+        }
+        Ok(())
+    })?;
+    let left = rest - 3 * width;
+    let notes =
+        (left > 0).then(|| format!("{left} of {rest} properties f_rest_* are left out: beyond degree {MAX_DEGREE}"));
+    Ok((Harmonics::from_rows(degree, data), notes.into_iter().collect()))
+}
+
+/// Bytes stand for the middles of 256 steps from -4 to 4; the first and the last for the ends.
+fn harmonic_of_byte(value: f64) -> f32 {
+    let part = match value {
+        v if v <= 0.0 => 0.0,
+        v if v >= 255.0 => 1.0,
+        v => (v + 0.5) / 256.0,
+    };
+    ((part - 0.5) * 8.0) as f32
 }
 
 /// Which of `names` each property of `element` is, if any; the first `needed` have to be there.

@@ -2,7 +2,8 @@
 
 use freerange_core::IoError;
 
-use crate::SplatError;
+use crate::{RenderMode, SplatError};
+use glam::DVec3;
 use std::{io::BufRead, path::Path};
 
 /// Longest line of a header, and longest whole header, in bytes.
@@ -98,6 +99,52 @@ pub(crate) struct Element {
 pub(crate) struct Header {
     pub format: Format,
     pub elements: Vec<Element>,
+    pub comments: Comments,
+}
+
+/// What comments say that concerns Gaussians; of several of a kind the last counts.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Comments {
+    /// `SplatRenderMode: default | mip | 2dgs` (Brush), or `antialiased 0 | 1` (Postshot).
+    pub mode: Option<RenderMode>,
+    /// `Vertical axis: X Y Z`, or a letter (Brush, whose y and z point down).
+    pub up: Option<DVec3>,
+    /// `Origin: X Y Z`, what positions are relative to (ours).
+    pub origin: Option<DVec3>,
+}
+
+impl Comments {
+    fn read(&mut self, words: &[&str]) {
+        let text = words.join(" ").to_ascii_lowercase();
+        let vector = |text: &str| -> Option<DVec3> {
+            let numbers: Vec<f64> = text.split(' ').map(str::parse).collect::<Result<_, _>>().ok()?;
+            Some(DVec3::from_array(numbers.try_into().ok()?)).filter(|v| v.is_finite())
+        };
+        match text.split_once(' ') {
+            Some(("splatrendermode:", value)) => {
+                self.mode = match value {
+                    "default" => Some(RenderMode::Default),
+                    "mip" => Some(RenderMode::Mip),
+                    "2dgs" => Some(RenderMode::Flat),
+                    _ => self.mode,
+                }
+            }
+            Some(("antialiased", "1")) => self.mode = Some(RenderMode::Mip),
+            Some(("antialiased", "0")) => self.mode = Some(RenderMode::Default),
+            Some(("vertical", rest)) => {
+                let axis = match rest.strip_prefix("axis: ") {
+                    Some("x") => Some(DVec3::X),
+                    Some("y") => Some(-DVec3::Y),
+                    Some("z") => Some(-DVec3::Z),
+                    Some(axis) => vector(axis).filter(|v| v.length_recip().is_normal()),
+                    None => None,
+                };
+                self.up = axis.or(self.up);
+            }
+            Some(("origin:", value)) => self.origin = vector(value).or(self.origin),
+            _ => {}
+        }
+    }
 }
 
 /// Reads up to and with the line `end_header`.
@@ -108,12 +155,14 @@ pub(crate) fn read_header(reader: &mut impl BufRead, file: &Path) -> Result<Head
         return Err(lines.error("the line \"ply\"", &first));
     }
     let mut format = None;
+    let mut comments = Comments::default();
     let mut elements: Vec<Element> = Vec::new();
     loop {
         let line = lines.next("the line \"end_header\"")?;
         let words: Vec<&str> = line.split_ascii_whitespace().collect();
         match words[..] {
-            [] | ["comment" | "obj_info", ..] => {}
+            ["comment", ref words @ ..] => comments.read(words),
+            [] | ["obj_info", ..] => {}
             ["end_header"] => break,
             ["format", name, "1.0"] if format.is_none() => {
                 format = Some(match name {
@@ -153,7 +202,7 @@ pub(crate) fn read_header(reader: &mut impl BufRead, file: &Path) -> Result<Head
         }
     }
     let Some(format) = format else { return Err(lines.error("a line \"format ...\" before", "end_header")) };
-    Ok(Header { format, elements })
+    Ok(Header { format, elements, comments })
 }
 
 struct Lines<'a, R> {

@@ -1,6 +1,10 @@
 //! `.ply` files: our own, those of other tools, and broken ones.
 
-use freerange_splat::{Cloud, PlyFile, SplatError, channel, parse_ply, read_ply, write_ply};
+use freerange_splat::{
+    Cloud, Harmonics, PlyFile, RenderMode, SplatError, Splats, channel, coefficients, encode_splats, parse_ply,
+    read_ply, write_ply,
+};
+use glam::DVec3;
 use proptest::prelude::*;
 use std::path::Path;
 
@@ -71,7 +75,7 @@ proptest! {
         write_ply(&cloud, &path).unwrap();
         let bytes = std::fs::read(&path).unwrap();
         prop_assert!(bytes.ends_with(b"end_header\n") || !cloud.is_empty());
-        assert_same(&read_ply(&path).unwrap().cloud, &cloud);
+        assert_same(&read_ply(&path).unwrap().splats.cloud, &cloud);
         write_ply(&cloud, &path).unwrap();
         prop_assert_eq!(bytes, std::fs::read(&path).unwrap());
         prop_assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
@@ -86,8 +90,8 @@ proptest! {
         for format in ["ascii", "binary_little_endian", "binary_big_endian"] {
             let text = header(format, 3, COLUMNS, "float");
             if let Ok(file) = parse(&[text.as_bytes(), &bytes].concat()) {
-                prop_assert_eq!(file.cloud.len(), 3);
-                prop_assert!(file.cloud.check_finite().is_ok());
+                prop_assert!((1..=3).contains(&file.splats.cloud.len()));
+                prop_assert!(file.splats.cloud.check_finite().is_ok());
             }
         }
     }
@@ -99,14 +103,14 @@ proptest! {
         bytes[at % length] = value;
         bytes.truncate(length - cut % length);
         if let Ok(file) = parse(&bytes) {
-            prop_assert!(file.cloud.check_finite().is_ok());
+            prop_assert!(file.splats.cloud.check_finite().is_ok());
         }
     }
 
     #[test]
     fn any_order_of_properties_will_do(order in Just(COLUMNS.split(' ').collect::<Vec<_>>()).prop_shuffle()) {
         let file = parse(ascii(&example(), &order.join(" ")).as_bytes()).unwrap();
-        assert_same(&file.cloud, &example());
+        assert_same(&file.splats.cloud, &example());
         prop_assert!(file.notes.is_empty());
     }
 }
@@ -147,7 +151,7 @@ fn both_byte_orders_and_doubles() {
                 }
             }
             bytes.extend(b"trailing bytes are nobody's");
-            assert_same(&parse(&bytes).unwrap().cloud, &cloud);
+            assert_same(&parse(&bytes).unwrap().splats.cloud, &cloud);
         }
     }
 }
@@ -170,9 +174,9 @@ fn files_of_other_tools() {
     bytes.extend(columns.split(' ').flat_map(|c| stored(cloud.row(0), c).to_le_bytes()));
     bytes.extend([0x7f; 12]);
     let file = parse(&bytes).unwrap();
-    assert_same(&file.cloud, &cloud);
+    assert_same(&file.splats.cloud, &cloud);
     assert_eq!(file.notes.len(), 3, "{:?}", file.notes);
-    assert!(file.notes[0].starts_with("3 properties f_rest_*"));
+    assert!(file.notes[0].starts_with("3 of 3 properties f_rest_*"));
     assert!(file.notes[1].contains("red"));
     assert!(file.notes[2].contains("face, nothing, after"));
 
@@ -181,7 +185,7 @@ fn files_of_other_tools() {
     let rest: String = columns.split(' ').skip(3).map(|c| format!("property float {c}\n")).collect();
     let text = format!("{text}{rest}end_header\n\n 1\t-2 3 2 0.5 0.25 0 0 0 1 2 3 4 0 0 0 0\r\n");
     let file = parse(text.as_bytes()).unwrap();
-    assert_eq!(file.cloud.rows(), [1.0, -2.0, 3.0, 2.0, 3.0, 4.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.5, 0.5, 0.5]);
+    assert_eq!(file.splats.cloud.rows(), [1.0, -2.0, 3.0, 2.0, 3.0, 4.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.5, 0.5, 0.5]);
     assert!(file.notes.iter().any(|n| n.contains("rotation of length zero")));
 }
 
@@ -214,9 +218,6 @@ fn errors_say_what_and_where() {
         (with(vertex, &format!("{vertex} 1")), &["row 2", "rot_3", "end of the line"]),
         (with(vertex, &words[1..].join(" ")), &["row 2", "rot_3", "a number", "end of the line"]),
         (with(vertex, &vertex.replacen(words[1], "one", 1)), &["row 2", "\"y\"", "a number (float)", "one"]),
-        (with(vertex, &vertex.replacen(words[9], "NaN", 1)), &["row 2", "\"opacity\"", "finite", "NaN"]),
-        (with(vertex, &vertex.replacen(words[9], "-inf", 1)), &["row 2", "\"opacity\"", "finite", "-inf"]),
-        (with(vertex, &vertex.replacen(words[6], "1e50", 1)), &["row 2", "\"f_dc_0\"", "finite", "inf"]),
     ] {
         assert!(parts.iter().all(|part| message.contains(part)), "{message:?} lacks one of {parts:?}");
     }
@@ -227,6 +228,134 @@ fn errors_say_what_and_where() {
     let error = write_ply(&poisoned, Path::new("never-written.ply")).unwrap_err();
     assert!(matches!(error, SplatError::Value { row: 1, channel: 6, .. }), "{error}");
     assert!(!Path::new("never-written.ply").exists());
+}
+
+/// An ascii file of the example, whose values of `column` in the first rows are `values`.
+fn with_values(column: &str, values: &[&str]) -> PlyFile {
+    let at = COLUMNS.split(' ').position(|c| c == column).unwrap();
+    let mut text = header("ascii", 6, COLUMNS, "float");
+    for (i, line) in ascii(&example(), COLUMNS).lines().skip_while(|l| *l != "end_header").skip(1).enumerate() {
+        let mut words: Vec<&str> = line.split(' ').collect();
+        words[at] = values.get(i).copied().unwrap_or(words[at]);
+        text += &(words.join(" ") + "\n");
+    }
+    parse(text.as_bytes()).unwrap()
+}
+
+#[test]
+fn infinite_opacities_are_those_of_0_and_1() {
+    let file = with_values("opacity", &["inf", "-inf"]);
+    let cloud = file.splats.cloud;
+    assert!(cloud.len() == 6 && 1.0 - cloud.opacity(0) < 2e-7 && cloud.opacity(1) < 2e-7);
+    assert!(file.notes.iter().any(|n| n.starts_with("2 Gaussians have an infinite opacity")), "{:?}", file.notes);
+    let flat = with_values("scale_1", &["-inf"]);
+    assert!(flat.splats.cloud.len() == 6 && flat.splats.cloud.scale(0).y < 1e-16);
+}
+
+#[test]
+fn gaussians_that_are_not_finite_are_left_out_and_counted() {
+    for (column, value) in [("opacity", "NaN"), ("x", "inf"), ("scale_0", "inf"), ("f_dc_0", "1e50"), ("rot_3", "-NaN")]
+    {
+        let file = with_values(column, &["0", value]);
+        assert_eq!(file.splats.cloud.len(), 5, "{column}");
+        assert_eq!(file.splats.cloud.row(1)[..2], example().row(2)[..2]);
+        assert!(file.notes.iter().any(|n| n.starts_with("1 Gaussians with numbers")), "{:?}", file.notes);
+    }
+    let all = header("ascii", 1, COLUMNS, "float") + &"NaN ".repeat(17) + "\n";
+    assert!(refusal(all.as_bytes()).contains("at least one Gaussian of finite numbers"));
+}
+
+#[test]
+fn flat_gaussians_have_no_third_deviation() {
+    let columns = COLUMNS.replace("scale_2 ", "");
+    let file = parse(ascii(&example(), &columns).as_bytes()).unwrap();
+    assert_eq!(file.splats.mode, RenderMode::Flat);
+    assert!(file.notes[0].contains("scale_2"), "{:?}", file.notes);
+    for (found, expected) in file.splats.cloud.iter().zip(&example()) {
+        assert_eq!((found[5], &found[..5], &found[6..11]), (-40.0, &expected[..5], &expected[6..11]));
+    }
+    let columns = COLUMNS.replace("scale_1 ", "");
+    assert!(refusal(ascii(&example(), &columns).as_bytes()).contains("scale_1"));
+}
+
+#[test]
+fn colors_may_be_bytes() {
+    let columns = "x y z opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3 red green blue";
+    let text = header("ascii", 1, columns, "float");
+    let row = "1 2 3 0.5 -1 -2 -3 1 0 0 0 255 51 0\n";
+    for (kind, most) in [("uchar", 255.0), ("ushort", 65535.0), ("float", 1.0)] {
+        let kinds = ["red", "green", "blue"]
+            .iter()
+            .fold(text.clone(), |t, c| t.replace(&format!("float {c}"), &format!("{kind} {c}")));
+        let file = parse((kinds + row).as_bytes()).unwrap();
+        let color = file.splats.cloud.color(0);
+        assert!(color.abs_diff_eq(DVec3::new(255.0, 51.0, 0.0) / most, 1e-6), "{kind}: {color}");
+        assert!(file.notes.is_empty(), "{:?}", file.notes);
+    }
+    assert!(refusal((text.replace("float red", "int red") + row).as_bytes()).contains("\"red\" of element"));
+}
+
+#[test]
+fn comments_tell_how_to_draw_and_which_way_is_up() {
+    let told = |comments: &[&str]| {
+        let lines: String = comments.iter().map(|c| format!("comment {c}\n")).collect();
+        let text = ascii(&example(), COLUMNS).replace("comment made by a test\n", &lines);
+        let file = parse(text.as_bytes()).unwrap();
+        (file.splats.mode, file.up)
+    };
+    assert_eq!(told(&[]), (RenderMode::Default, None));
+    assert_eq!(told(&["SplatRenderMode: mip", "Vertical axis: y"]), (RenderMode::Mip, Some(-DVec3::Y)));
+    assert_eq!(
+        told(&["antialiased 1", "vertical  axis: 0 0.6 0.8"]),
+        (RenderMode::Mip, Some(DVec3::new(0.0, 0.6, 0.8)))
+    );
+    assert_eq!(told(&["SplatRenderMode: mip", "antialiased 0"]), (RenderMode::Default, None));
+    assert_eq!(told(&["SplatRenderMode: 2dgs", "SplatRenderMode: of 2040"]), (RenderMode::Flat, None));
+    assert_eq!(
+        told(&["Vertical axis: 0 0 0", "Vertical axis: 1 NaN 2", "Vertical axis:"]),
+        (RenderMode::Default, None)
+    );
+}
+
+#[test]
+fn harmonics_mode_axis_and_origin_survive() {
+    let cloud = example();
+    for degree in 0..=3 {
+        let width = 3 * coefficients(degree);
+        let harmonics = Harmonics::from_rows(degree, (0..6 * width).map(|v| (v as f32 * 0.37).cos()).collect());
+        let origin = DVec3::new(4e6, -1e6, 2.0) * f64::from(u8::from(degree == 2));
+        let splats = Splats { cloud: cloud.clone(), harmonics, mode: RenderMode::Mip, origin };
+        let bytes = encode_splats(&splats, -DVec3::Y).unwrap();
+        let file = parse(&bytes).unwrap();
+        assert_same(&file.splats.cloud, &cloud);
+        let (harmonics, mode) = (&file.splats.harmonics, file.splats.mode);
+        assert_eq!((harmonics, mode, file.up), (&splats.harmonics, RenderMode::Mip, Some(-DVec3::Y)));
+        assert_eq!(file.splats.origin, origin);
+        // Channel by channel: the second number of a Gaussian is its second coefficient of red.
+        if degree > 0 {
+            let text = String::from_utf8_lossy(&bytes);
+            let start = text.find("end_header\n").unwrap() + 11 + 9 * 4;
+            let second = f32::from_le_bytes(bytes[start + 4..start + 8].try_into().unwrap());
+            assert_eq!(second, splats.harmonics.row(0)[3]);
+        }
+    }
+}
+
+#[test]
+fn positions_of_64_bits_far_away_keep_their_shape() {
+    let far = [3_959_505.25f64, -3_699_979.5, 12.0];
+    let mut bytes = header("binary_little_endian", 6, COLUMNS, "double").into_bytes();
+    for row in &example() {
+        for column in COLUMNS.split(' ') {
+            let shift = "xyz".find(column).map_or(0.0, |k| far[k]);
+            bytes.extend((f64::from(stored(row, column)) + shift).to_le_bytes());
+        }
+    }
+    let splats = parse(&bytes).unwrap().splats;
+    for i in 0..6 {
+        let expected = example().mean(i) + DVec3::from_array(far);
+        assert!((splats.position(i) - expected).length() < 1e-6, "{}", splats.position(i) - expected);
+    }
 }
 
 #[test]
@@ -278,15 +407,15 @@ fn compressed(chunks: usize, gaussians: usize, word: u32) -> Vec<u8> {
 fn compressed_files_are_unpacked_between_the_bounds_of_their_chunk() {
     // All ones are the greatest value, of a rotation three components of half the root of 2: more than a unit
     // quaternion has.
-    let row = *parse(&compressed(1, 3, u32::MAX)).unwrap().cloud.row(2);
+    let row = *parse(&compressed(1, 3, u32::MAX)).unwrap().splats.cloud.row(2);
     assert_eq!(row[..6], [3.0; 6]);
     assert!(row[6..9].iter().all(|v| (v - (1f32 / 3.0).sqrt()).abs() < 1e-6) && row[9] == 0.0, "{row:?}");
     assert!(row[10] > 5.5 && row[11..] == [1.0; 3]);
-    let row = *parse(&compressed(1, 1, 0)).unwrap().cloud.row(0);
+    let row = *parse(&compressed(1, 1, 0)).unwrap().splats.cloud.row(0);
     assert_eq!(row[..6], [-1.0; 6]);
     assert!(row[10] < -5.5 && row[11..] == [0.0; 3]);
     // Gaussian 256 is in the second chunk.
-    assert_eq!(parse(&compressed(2, 257, 0)).unwrap().cloud.len(), 257);
+    assert_eq!(parse(&compressed(2, 257, 0)).unwrap().splats.cloud.len(), 257);
 }
 
 #[test]

@@ -1,5 +1,6 @@
 use freerange_camera::FrameConfig;
 use freerange_flow::sample::SampleConfig;
+use freerange_splat::Cloud;
 
 /// What a reconstruction should do. [`Reconstructor::options`](crate::Reconstructor::options) gives the model's own.
 #[derive(Clone, Debug)]
@@ -14,6 +15,8 @@ pub struct Options {
     pub views: Option<usize>,
     /// Leave the network out: what sampling would start from is the sample. The control of every comparison.
     pub without_network: bool,
+    /// Gaussians to start from instead of initial fits, in the frame of the views.
+    pub init: Option<Cloud>,
     /// Which way is up in the views' frame, and where the object is, if that is known.
     pub frame: FrameConfig,
 }

@@ -7,9 +7,9 @@ use freerange_camera::{
     image_ops::{composite, to_picture},
 };
 use freerange_core::IoError;
-use freerange_raster::{RasterConfig, render};
-use freerange_splat::Cloud;
-use glam::DVec3;
+use freerange_raster::{MIP_BLUR, RasterConfig, mip_compensated, render};
+use freerange_splat::{Cloud, RenderMode, Splats};
+use glam::{DMat4, DVec3};
 use image::{Delay, Frame, RgbaImage, codecs::gif};
 
 use crate::Error;
@@ -23,6 +23,24 @@ pub const WHITE: [f32; 3] = [1.0; 3];
 /// If the rasteriser refuses the camera or the cloud.
 pub fn render_view(cloud: &Cloud, camera: &Camera) -> Result<Vec<f32>, Error> {
     Ok(render(cloud.rows(), &[*camera], &[WHITE], &RasterConfig::default())?.rgb)
+}
+
+/// Renders one view of Gaussians from a file on white, with colors as seen from this camera and drawn in `mode`.
+/// `[h, w, 3]`, as [`render_view`].
+///
+/// # Errors
+/// If the rasteriser refuses the camera or the cloud.
+pub fn render_splats(splats: &Splats, camera: &Camera, mode: RenderMode) -> Result<Vec<f32>, Error> {
+    let cloud = splats.seen_from(camera.center());
+    // Positions are relative to the origin, which may be far away.
+    let world_to_camera = camera.world_to_camera * DMat4::from_translation(splats.origin);
+    let camera = Camera { world_to_camera, ..*camera };
+    if mode != RenderMode::Mip {
+        return render_view(&cloud, &camera);
+    }
+    let rows = mip_compensated(cloud.rows(), &camera, MIP_BLUR);
+    let config = RasterConfig { blur: MIP_BLUR, ..RasterConfig::default() };
+    Ok(render(&rows, &[camera], &[WHITE], &config)?.rgb)
 }
 
 /// An image composited on white.
@@ -49,4 +67,50 @@ pub fn write_turntable(path: &Path, cloud: &Cloud, frames: u32, size: u32) -> Re
         encoder.encode_frame(frame).map_err(broken)?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use freerange_splat::{Harmonics, channel, coefficients};
+
+    /// A few Gaussians, as small as pixels.
+    fn example(degree: usize) -> Splats {
+        let wave = |n: usize| (0..n).map(|v| (v as f32 * 0.7).sin()).collect::<Vec<_>>();
+        let mut cloud = Cloud::from_rows(wave(30 * channel::COUNT));
+        for row in cloud.iter_mut() {
+            row[channel::MEAN].iter_mut().for_each(|v| *v *= 0.4);
+            row[channel::LOG_SCALE].iter_mut().for_each(|v| *v -= 4.0);
+        }
+        let harmonics = Harmonics::from_rows(degree, wave(30 * 3 * coefficients(degree)));
+        Splats { harmonics, ..cloud.into() }
+    }
+
+    fn camera(eye: DVec3) -> Camera {
+        Camera::look_at(eye, DVec3::ZERO, DVec3::Z, 0.6, 48, 48)
+    }
+
+    fn apart(a: &[f32], b: &[f32]) -> f32 {
+        a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
+    }
+
+    #[test]
+    fn gaussians_from_files_are_drawn_with_harmonics_mode_and_origin() {
+        let (splats, camera) = (example(2), camera(DVec3::new(2.0, -1.0, 0.7)));
+        let shown = render_splats(&splats, &camera, RenderMode::Default).unwrap();
+        // What is the same from all sides is drawn as results are.
+        let constant = Splats { harmonics: Harmonics::default(), ..splats.clone() };
+        let plain = render_splats(&constant, &camera, RenderMode::Default).unwrap();
+        assert_eq!(plain, render_view(&splats.cloud, &camera).unwrap());
+        assert!(apart(&shown, &plain) > 0.1);
+        // The color from here, as the constant one.
+        let baked = Splats::from(splats.seen_from(camera.center()));
+        assert_eq!(shown, render_splats(&baked, &camera, RenderMode::Default).unwrap());
+        assert!(apart(&shown, &render_splats(&splats, &camera, RenderMode::Mip).unwrap()) > 0.02);
+
+        let far = DVec3::new(4e6, -3e6, 1e6);
+        let moved = Splats { origin: far, ..splats.clone() };
+        let there = Camera { world_to_camera: camera.world_to_camera * DMat4::from_translation(-far), ..camera };
+        assert!(apart(&shown, &render_splats(&moved, &there, RenderMode::Default).unwrap()) < 1e-3);
+    }
 }

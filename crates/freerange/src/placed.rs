@@ -67,6 +67,26 @@ impl Placed {
         Ok(Self { frame, canonical, chosen, shown, axis: None, photos: views.len(), settled })
     }
 
+    /// Gaussians of the user's frame in the canonical one; those that are not of the object, which lies within a radius
+    /// of 0.5, are left out.
+    pub fn canonical_init(&mut self, init: &Cloud) -> Result<Cloud, Error> {
+        const RADIUS: f64 = 0.6;
+        let Similarity { scale, rotation, translation } = self.frame.canonical_from_user;
+        let mut cloud = init.clone();
+        cloud.transform(scale, rotation, translation);
+        let kept: Vec<usize> = (0..cloud.len()).filter(|i| cloud.mean(*i).length() <= RADIUS).collect();
+        let (all, left) = (cloud.len(), cloud.len() - kept.len());
+        if kept.is_empty() {
+            return Err(Error::input("init", "Gaussians where the cameras look", format!("none of {all} there")));
+        }
+        if left > 0 {
+            self.frame
+                .notes
+                .push(format!("{left} of {all} Gaussians to start from lie beside the object, and are left out"));
+        }
+        Ok(cloud.select(kept))
+    }
+
     /// Looks for what leaves the object as it is, and adds what that shows of it: mirrored photos as further views, turned outlines as further
     /// outlines, each where photos contradict it by no more than `sample` allows.
     pub fn symmetries(

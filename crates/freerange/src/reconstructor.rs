@@ -92,7 +92,14 @@ impl Reconstructor {
     /// If what the checkpoint says of it cannot be used.
     pub fn options(&self) -> Result<Options, Error> {
         let sample = sampling(&self.checkpoint.provenance)?;
-        Ok(Options { sample, seeds: vec![0], views: None, without_network: false, frame: FrameConfig::default() })
+        Ok(Options {
+            sample,
+            seeds: vec![0],
+            views: None,
+            without_network: false,
+            init: None,
+            frame: FrameConfig::default(),
+        })
     }
 
     /// Most views that the model has seen at once in training; the paper's four where its checkpoint does not tell.
@@ -124,6 +131,13 @@ impl Reconstructor {
         }
         if options.without_network && options.sample.start.is_none() {
             return Err(Error::input("sample.start", "a quick fit to start from", "none"));
+        }
+        if options.init.is_some() && options.sample.start.is_none() {
+            return Err(Error::input(
+                "sample.start",
+                "a start from Gaussians, as there are some to start from",
+                "none",
+            ));
         }
         if options.views == Some(0) {
             return Err(Error::input("views", "at least 1", 0));
@@ -164,7 +178,15 @@ impl Reconstructor {
             seconds.push((Stage::Mirror, begin.elapsed().as_secs_f64()));
         }
         let mut fits = Vec::new();
-        if let Some(StartConfig { fit, .. }) = &options.sample.start {
+        if let Some(init) = &options.init {
+            let begin = Instant::now();
+            // Where the object is, an initial fit finds out.
+            if !placed.settled {
+                placed.quick_fits(&QuickFitConfig::default(), &[0], 1, &mut tell)?;
+            }
+            fits = vec![vec![placed.canonical_init(init)?; options.seeds.len()]; members];
+            seconds.push((Stage::Fit, begin.elapsed().as_secs_f64()));
+        } else if let Some(StartConfig { fit, .. }) = &options.sample.start {
             let begin = Instant::now();
             fits = placed.quick_fits(fit, &options.seeds, members, &mut tell)?;
             seconds.push((Stage::Fit, begin.elapsed().as_secs_f64()));

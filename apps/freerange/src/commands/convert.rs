@@ -1,50 +1,140 @@
 //! `freerange convert`
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use freerange_formats::{Format, Frame, SpzVersion, WriteOptions, read, write};
+use freerange_formats::{Format, Frame, Frames, SpzVersion, WriteOptions, read, write};
+use freerange_splat::Splats;
+use freerange_surface::{MeshConfig, MeshFormat, mesh_of, save};
+use glam::{DQuat, DVec3};
 
 use crate::error::CliError;
 
-/// Convert Gaussians between .ply, .splat, .spz, .sog, .glb and .html, by the extensions of the two files.
+/// Convert Gaussians between formats, by the extensions of the files; merge, crop, clean and scale them.
 ///
 /// .glb and .spz have +y up by definition. The others are in whatever frame they were made in, which --frame tells:
-/// what is read is turned from the one to the other only where two files differ in it. An .html is a page that shows
-/// the Gaussians in any browser, offline. A .ply may be compressed (as SuperSplat writes it); colour that depends on
-/// the viewing direction is left out.
+/// what is read is turned only where two files differ in it. An .html is a page that shows the Gaussians in any
+/// browser, offline. Read as well: compressed .ply (SuperSplat), .sog as a folder (its meta.json), .gltf. Of several
+/// inputs all Gaussians are written. The order of work: turn, merge, --box, --sphere, --remove-floaters, --measure.
+///
+/// --mesh renders depths from all around and fuses them; what no camera sees is taken for the inside.
 #[derive(clap::Args)]
 pub struct Args {
-    /// File to read.
-    input: PathBuf,
-    /// File to write.
-    output: PathBuf,
+    /// Files to read, and at the end the file to write.
+    #[arg(required = true, num_args = 2.., value_names = ["INPUT", "OUTPUT"])]
+    files: Vec<PathBuf>,
     /// Frame of files that do not fix their own: z-up (this program's), y-up, or y-down (most programs that train on
-    /// COLMAP's cameras). FROM:TO turns between them, as in y-down:z-up.
-    #[arg(long, value_name = "FRAME", default_value = "z-up", value_parser = parse_frames)]
-    frame: (Frame, Frame),
-    /// Version of .spz to write: 3, which all readers take, or 4.
-    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u8).range(3..=4))]
-    spz_version: u8,
+    /// COLMAP's cameras) [default: z-up, or what a .ply says]. FROM:TO turns: FROM is the frame of what is read,
+    /// whatever its format says (many .spz are y-down), TO that of what is written.
+    #[arg(long, value_name = "FRAME")]
+    frame: Option<Frames>,
+    /// Version of .spz to write: 3; 4, for newer readers; 2, for the oldest (rotations err by up to 10 degrees).
+    #[arg(long, value_name = "VERSION", default_value = "3")]
+    spz_version: SpzVersion,
+    /// Keep only Gaussians whose centers lie between two corners: X,Y,Z:X,Y,Z, in the written frame.
+    #[arg(long, value_name = "CORNER:CORNER", value_parser = parse_box, allow_hyphen_values = true)]
+    r#box: Option<(DVec3, DVec3)>,
+    /// Keep only Gaussians whose centers lie in a sphere: X,Y,Z:RADIUS.
+    #[arg(long, value_name = "CENTER:RADIUS", value_parser = parse_sphere, allow_hyphen_values = true)]
+    sphere: Option<(DVec3, f64)>,
+    /// Leave out Gaussians that are connected to nothing large.
+    #[arg(long)]
+    remove_floaters: bool,
+    /// Scale about the origin so that two points are LENGTH apart: X,Y,Z:X,Y,Z=LENGTH.
+    #[arg(long, value_name = "A:B=LENGTH", value_parser = parse_measure, allow_hyphen_values = true)]
+    measure: Option<f64>,
+    /// Write a closed triangle mesh of the surface, with vertex colors: .glb, .ply or .obj.
+    #[arg(long)]
+    mesh: bool,
+    /// Voxels along the longest side, of which the mesh is made.
+    #[arg(long, value_name = "COUNT", default_value_t = MeshConfig::default().voxels, requires = "mesh")]
+    voxels: usize,
 }
 
-/// `FRAME` or `FROM:TO`.
-fn parse_frames(text: &str) -> Result<(Frame, Frame), String> {
-    let (from, to) = text.split_once(':').unwrap_or((text, text));
-    Ok((from.parse()?, to.parse()?))
+fn parse_point(text: &str) -> Result<DVec3, String> {
+    let wrong = || format!("expected a point X,Y,Z, found {text:?}");
+    let numbers: Vec<f64> = text.split(',').map(|v| v.trim().parse()).collect::<Result<_, _>>().map_err(|_| wrong())?;
+    let point = DVec3::from_array(numbers.try_into().map_err(|_| wrong())?);
+    if point.is_finite() { Ok(point) } else { Err(wrong()) }
+}
+
+fn parse_box(text: &str) -> Result<(DVec3, DVec3), String> {
+    let (a, b) = text.split_once(':').ok_or("expected two corners X,Y,Z:X,Y,Z")?;
+    Ok((parse_point(a)?, parse_point(b)?))
+}
+
+fn parse_sphere(text: &str) -> Result<(DVec3, f64), String> {
+    let (center, radius) = text.split_once(':').ok_or("expected a center and a radius, X,Y,Z:RADIUS")?;
+    Ok((parse_point(center)?, parse_length(radius)?))
+}
+
+/// The factor that makes two points so far apart.
+fn parse_measure(text: &str) -> Result<f64, String> {
+    let (points, length) = text.split_once('=').ok_or("expected two points and their distance, X,Y,Z:X,Y,Z=LENGTH")?;
+    let (a, b) = parse_box(points)?;
+    let factor = parse_length(length)? / a.distance(b);
+    if factor.is_normal() { Ok(factor) } else { Err(format!("expected two different points, found {points:?}")) }
+}
+
+fn parse_length(text: &str) -> Result<f64, String> {
+    let length = text.trim().parse().ok().filter(|v: &f64| v.is_normal() && *v > 0.0);
+    length.ok_or_else(|| format!("expected a length above 0, found {text:?}"))
 }
 
 pub fn run(args: &Args) -> Result<(), CliError> {
-    Format::of(&args.output)?; // before anything is read
-    let (from, to) = args.frame;
-    let mut loaded = read(&args.input, from)?;
-    if from != to {
-        loaded.cloud.transform(1.0, from.to(to), glam::DVec3::ZERO);
+    let Some((output, inputs)) = args.files.split_last() else { unreachable!("two files are required") };
+    // Before anything is read.
+    if args.mesh {
+        MeshFormat::of(output)?;
+    } else {
+        Format::of(output)?;
     }
-    let spz_version = if args.spz_version == 4 { SpzVersion::V4 } else { SpzVersion::V3 };
-    let notes = write(&loaded.cloud, &args.output, &WriteOptions { frame: to, spz_version })?;
-    for note in loaded.notes.iter().chain(&notes) {
-        eprintln!("note: {note}");
+    let (mut splats, frame) = merged(inputs, args.frame.unwrap_or_default())?;
+    if let Some((a, b)) = args.r#box {
+        splats = kept(&splats, &splats.within_box(a, b), "in the box")?;
     }
-    println!("{} ({} Gaussians)", args.output.display(), loaded.cloud.len());
+    if let Some((center, radius)) = args.sphere {
+        splats = kept(&splats, &splats.within_sphere(center, radius), "in the sphere")?;
+    }
+    if args.remove_floaters {
+        splats = kept(&splats, &splats.without_floaters(), "no floaters")?;
+    }
+    if let Some(factor) = args.measure {
+        splats.transform(factor, DQuat::IDENTITY, DVec3::ZERO);
+        eprintln!("note: scaled by {factor}");
+    }
+    if args.mesh {
+        let shape = mesh_of(&splats, &MeshConfig { voxels: args.voxels, ..MeshConfig::default() })?;
+        save(&shape, output, frame.to(Frame::Y_UP))?;
+        println!("{} ({} triangles)", output.display(), shape.triangles.len());
+        return Ok(());
+    }
+    let notes = write(&splats, output, &WriteOptions { frame, spz_version: args.spz_version })?;
+    notes.iter().for_each(|note| eprintln!("note: {note}"));
+    println!("{} ({} Gaussians)", output.display(), splats.cloud.len());
     Ok(())
+}
+
+/// All Gaussians of the files, in one frame.
+fn merged(inputs: &[PathBuf], mut frames: Frames) -> Result<(Splats, Frame), CliError> {
+    let mut all: Option<(Splats, Frame)> = None;
+    for input in inputs {
+        let loaded = read(input, frames)?;
+        let of = |note| if inputs.len() > 1 { format!("{}: {note}", input.display()) } else { note };
+        loaded.notes.into_iter().for_each(|note| eprintln!("note: {}", of(note)));
+        match &mut all {
+            None => all = Some((loaded.splats, loaded.frame)),
+            Some((splats, _)) => splats.append(&loaded.splats),
+        }
+        frames.to = Some(loaded.frame); // the first file's is that of all
+    }
+    all.ok_or_else(|| CliError::file(Path::new(""), "expected a file to read"))
+}
+
+fn kept(splats: &Splats, indices: &[usize], which: &str) -> Result<Splats, CliError> {
+    let (all, found) = (splats.cloud.len(), indices.len());
+    if found == 0 {
+        return Err(CliError::input(format!("expected Gaussians {which}, found none of {all}")));
+    }
+    eprintln!("note: {found} of {all} Gaussians are {which}, {} are left out", all - found);
+    Ok(splats.select(indices))
 }

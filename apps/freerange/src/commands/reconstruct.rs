@@ -10,12 +10,15 @@ use std::{
 };
 
 use freerange::{
-    Compute, Device, DeviceName, EncoderPlaces, Options, Reconstructor, SETTINGS_SCHEMA, SampleConfig, Scores, Solver,
-    Stage, View,
+    Cloud, Compute, Device, DeviceName, EncoderPlaces, Options, Reconstructor, SETTINGS_SCHEMA, SampleConfig, Scores,
+    Solver, Stage, View,
     pictures::{on_white, render_view, write_turntable},
     score, write_ply,
 };
-use freerange_camera::image_ops::{sheet, to_picture};
+use freerange_camera::{
+    FrameConfig, canonical_from_user,
+    image_ops::{sheet, to_picture},
+};
 use freerange_eval::memory::peak_memory;
 use freerange_formats::{Format, Frame, WriteOptions};
 use serde::Serialize;
@@ -63,6 +66,9 @@ pub struct Args {
     /// once in training, six for the shipped one]. Refinement looks at all.
     #[arg(long, value_name = "K", value_parser = clap::value_parser!(u16).range(1..=256))]
     views: Option<u16>,
+    /// Start from these Gaussians instead of initial fits: a file of any format, in the frame of the cameras.
+    #[arg(long, value_name = "FILE", conflicts_with = "list")]
+    init: Option<PathBuf>,
     #[command(flatten)]
     photos: Photos,
     #[command(flatten)]
@@ -319,6 +325,22 @@ fn run_in(args: &Args, job: &Job) -> Result<(), CliError> {
     Ok(())
 }
 
+/// The Gaussians of a file, in the frame of the views.
+fn init(file: &Path, views: &[View], config: &FrameConfig) -> Result<Cloud, CliError> {
+    // The canonical frame has +z up.
+    let up = canonical_from_user(views, config)?.canonical_from_user.rotation.inverse() * glam::DVec3::Z;
+    let loaded = freerange_formats::read(file, Frame::with_up(up).unwrap_or_default())?;
+    loaded.notes.iter().for_each(|note| eprintln!("note: {}: {note}", file.display()));
+    let degree = loaded.splats.harmonics.degree();
+    if degree > 0 {
+        eprintln!(
+            "note: {}: colors that depend on the viewing direction (degree {degree}) are left out",
+            file.display()
+        );
+    }
+    Ok(loaded.splats.into_cloud())
+}
+
 /// Makes one scene and writes its results; the report, also as JSON. `begin`: when it was begun to be read; `commit`: is called before
 /// anything in the folder changes.
 fn reconstruct(
@@ -341,6 +363,7 @@ fn reconstruct(
     let mut options = args.sampling.options(model, args.samples)?;
     options.views = args.views.map(usize::from);
     options.frame = scene.frame;
+    options.init = args.init.as_deref().map(|file| init(file, &inputs, &options.frame)).transpose()?;
     let output = OutputFolder::create("reconstruct", folder)?;
     let mut seconds = vec![("load", begin.elapsed().as_secs_f64())];
 
@@ -366,7 +389,7 @@ fn reconstruct(
             let name = if *format == Format::Html { "view" } else { "gaussians" };
             let options = WriteOptions { frame, ..WriteOptions::default() };
             let path = output.path(&format!("{name}{suffix}.{format}"))?;
-            let lost = freerange_formats::write(&sample.gaussians, &path, &options)?;
+            let lost = freerange_formats::write(&sample.gaussians.clone().into(), &path, &options)?;
             notes.extend(lost.into_iter().map(|note| format!("{name}{suffix}.{format}: {note}")));
         }
         write_turntable(&output.path(&format!("turntable{suffix}.gif"))?, &sample.canonical, 48, 256)?;

@@ -2,38 +2,63 @@
 
 use std::path::PathBuf;
 
-use freerange::pictures::render_view;
+use freerange::pictures::render_splats;
 use freerange_camera::{image_ops::to_picture, load_cameras};
-use freerange_formats::{Frame, Loaded, read};
+use freerange_formats::{Format, Frames, Loaded, read};
+use freerange_splat::RenderMode;
 
 use crate::{error::CliError, output::OutputFolder, progress::Progress};
 
 /// Render Gaussians from given cameras: one PNG per frame, on white.
+///
+/// Colors follow the viewing direction where the file has spherical harmonics (degree 0 to 3).
 #[derive(clap::Args)]
 pub struct Args {
-    /// Gaussians: .ply, .splat, .spz, .sog, .glb, or .html that this program wrote.
+    /// Gaussians: .ply, .splat, .spz, .sog (or its meta.json), .glb, .gltf, or .html that this program wrote.
     file: PathBuf,
     /// transforms.json, or the folder that holds it; images are not needed where it says `w` and `h`.
     #[arg(long, value_name = "TRANSFORMS.json")]
     cameras: PathBuf,
-    /// Frame of the cameras: .glb and .spz, which have +y up, are turned into it; z-up, y-up or y-down.
+    /// Frame of the cameras, to which .glb and .spz (+y up) are turned: z-up, y-up or y-down. FROM:TO tells that of the
+    /// file as well, whatever it says.
     #[arg(long, default_value = "z-up")]
-    frame: Frame,
+    frame: Frames,
+    /// How to draw: default (blur of 0.3 square pixels) or mip (0.1, with lowered opacities) [default: as a .ply or .sog
+    /// says].
+    #[arg(long, value_name = "MODE", value_parser = parse_mode)]
+    mode: Option<RenderMode>,
     /// Where the pictures go.
     #[arg(short, long, default_value = "renders")]
     output: PathBuf,
 }
 
+fn parse_mode(text: &str) -> Result<RenderMode, String> {
+    match text {
+        "default" => Ok(RenderMode::Default),
+        "mip" => Ok(RenderMode::Mip),
+        _ => Err("expected default or mip".into()),
+    }
+}
+
 pub fn run(args: &Args) -> Result<(), CliError> {
-    let Loaded { cloud, notes } = read(&args.file, args.frame)?;
+    let Loaded { splats, notes, .. } = read(&args.file, args.frame)?;
     for note in notes {
         eprintln!("note: {note}");
+    }
+    // Some writers of .spz mark all of their files.
+    let told = if Format::of_input(&args.file)? == Format::Spz { RenderMode::Default } else { splats.mode };
+    let mode = args.mode.unwrap_or(told);
+    if args.mode.is_none() && splats.mode == RenderMode::Mip {
+        eprintln!(
+            "note: drawn in mode {}",
+            if mode == RenderMode::Mip { "mip" } else { "default; --mode mip heeds the mark" }
+        );
     }
     let cameras = load_cameras(&args.cameras)?;
     let output = OutputFolder::create("render", &args.output)?;
     let mut bar = Progress::new("rendering", cameras.len() as u64);
     for (i, (name, camera)) in cameras.iter().enumerate() {
-        let picture = to_picture(&render_view(&cloud, camera)?, camera.width, camera.height);
+        let picture = to_picture(&render_splats(&splats, camera, mode)?, camera.width, camera.height);
         let name = name.rsplit(['/', '\\']).next().unwrap_or("view");
         output.picture(&format!("{name}.png"), &picture)?;
         bar.at(i as u64 + 1, name);

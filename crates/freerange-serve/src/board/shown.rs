@@ -118,10 +118,10 @@ impl Board {
             }
             (job.folder.clone(), job.record.up, job.record.title.clone())
         };
-        let cloud = read_ply(&sample_file(&folder, i)).map_err(Refusal::own)?.cloud;
+        let splats = read_ply(&sample_file(&folder, i)).map_err(Refusal::own)?.splats;
         let frame = Frame::with_up(DVec3::from_array(up)).unwrap_or_default();
         let options = WriteOptions { frame, ..WriteOptions::default() };
-        let encoded = freerange_formats::encode(&cloud, format, &options).map_err(Refusal::own)?;
+        let encoded = freerange_formats::encode(&splats, format, &options).map_err(Refusal::own)?;
         // Nothing of a client's name may end the header or name a folder.
         let plain: String = state.chars().filter(|c| c.is_ascii_alphanumeric() || "-_".contains(*c)).take(40).collect();
         let plain = if plain.is_empty() { "gaussians".to_owned() } else { plain };
@@ -138,6 +138,6 @@ impl Board {
             }
             job.folder.clone()
         };
-        Ok(bytes(&read_ply(&sample_file(&folder, i)).map_err(Refusal::own)?.cloud))
+        Ok(bytes(&read_ply(&sample_file(&folder, i)).map_err(Refusal::own)?.splats.cloud))
     }
 }

@@ -133,7 +133,7 @@ impl Method {
             Self::Ply(folder) => {
                 let file = read_ply(&ply_file(folder, &case.object, case.views)?)?;
                 notes = file.notes;
-                vec![(0, file.cloud)]
+                vec![(0, file.splats.cloud)]
             }
         };
         Ok(Reconstructed { clouds, notes })
