@@ -234,7 +234,7 @@ fn images_that_do_not_serve_are_refused() {
     RgbImage::from_fn(SIDE, SIDE, |x, y| Rgb([(x * 8) as u8, (y * 8) as u8, ((x ^ y) * 8) as u8])).save(&path).unwrap();
     assert_says(&files.refusal(&d), &["frame 2", "alpha channel", "border"]);
     RgbImage::from_pixel(SIDE, SIDE, Rgb([9; 3])).save(&path).unwrap();
-    assert_says(&files.refusal(&d), &["frame 2", "nothing but the colour"]);
+    assert_says(&files.refusal(&d), &["frame 2", "nothing but the color"]);
     RgbaImage::new(SIDE, SIDE).save(&path).unwrap();
     assert_says(&files.refusal(&d), &["frame 2", "transparent everywhere"]);
     // A header that promises a huge image is refused before anything is allocated.

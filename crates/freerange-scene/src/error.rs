@@ -88,7 +88,7 @@ pub enum SceneError {
         advice: &'static str,
     },
     /// An image is not there.
-    #[error("{place}: no image {} (looked in {}; --images FOLDER says where else)", image.display(), folders.join(", "))]
+    #[error("{place}: none of its images is there, {} the first (looked in {}; --images FOLDER says where else)", image.display(), folders.join(", "))]
     MissingImage {
         /// The file and place that name it.
         place: String,
@@ -96,6 +96,20 @@ pub enum SceneError {
         image: PathBuf,
         /// Where it was looked for.
         folders: Vec<String>,
+    },
+    /// One image file is two photos.
+    #[error(
+        "{}: expected one photo for this file, found two with different poses: {first} and {second}; give photos names of their own, or folders \
+         as in the cameras' file",
+        file.display()
+    )]
+    SameFile {
+        /// The image.
+        file: PathBuf,
+        /// Name of one photo.
+        first: String,
+        /// Name of the other.
+        second: String,
     },
     /// An image or mask cannot be decoded.
     #[error("{}: cannot decode", file.display())]
@@ -176,6 +190,11 @@ impl In<'_> {
 
     pub fn unsupported(self, place: &str, feature: impl ToString, advice: &'static str) -> SceneError {
         SceneError::Unsupported { file: self.0.into(), place: place.into(), feature: feature.to_string(), advice }
+    }
+
+    /// An image of a kind that is not decoded.
+    pub fn unreadable(self, kind: &str) -> SceneError {
+        self.unsupported("", format!("a {kind} image"), freerange_camera::scene::CONVERT)
     }
 
     pub fn read(self, source: std::io::Error) -> SceneError {

@@ -14,4 +14,5 @@ mod network;
 pub mod read;
 
 pub use error::SceneError;
+pub use freerange_core::{Note, NoteKind};
 pub use load::{LoadConfig, Loaded, MaskKind, MaskModel, MaskSource, PixelRange, cut, files, load, up_of, write_masks};

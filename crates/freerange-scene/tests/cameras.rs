@@ -2,7 +2,7 @@
 
 use freerange_camera::{Camera, Lens};
 use freerange_scene::{
-    SceneError,
+    Note, NoteKind, SceneError,
     read::{Format, Intrinsics, Turntable, cameras, colmap, metashape, polycam, realitycapture},
 };
 use glam::{DMat3, DVec2, DVec3, DVec4};
@@ -171,12 +171,18 @@ fn broken_colmap_files_are_refused() {
     }
     std::fs::write(sparse.join("cameras.txt"), &good).unwrap();
     std::fs::remove_file(scene.path().join("images/camera000001_frame000001.png")).unwrap();
-    says(cameras(scene.path(), None, None), &["frame000001.png", "images.txt", "looked in"]);
+    let fewer = cameras(scene.path(), None, None).unwrap();
+    assert_eq!(fewer.photos.len(), 2);
+    let told = |n: &Note| n.kind == NoteKind::Warning && n.contains("1 of 3") && n.contains("frame000001.png");
+    assert!(fewer.notes.iter().any(told), "{:?}", fewer.notes);
     // Names never lead out of the folder.
     let images = std::fs::read_to_string(sparse.join("images.txt")).unwrap();
     std::fs::write(scene.path().join("outside.png"), b"").unwrap();
     std::fs::write(sparse.join("images.txt"), images.replace("camera000001_frame000001.png", "../../x.png")).unwrap();
-    says(cameras(scene.path(), None, None), &["no image"]);
+    assert!(cameras(scene.path(), None, None).unwrap().notes.iter().any(|n| n.contains("../../x.png")));
+    // None at all.
+    std::fs::remove_dir_all(scene.path().join("images")).unwrap();
+    says(cameras(scene.path(), None, None), &["none of its images", "images.txt", "looked in"]);
 }
 
 #[test]
@@ -245,7 +251,7 @@ fn polycam_is_read_as_nerfstudio_reads_it() {
         }
     }
     let file = Path::new("1.json");
-    let camera = polycam::camera(file, root.to_string().as_bytes()).unwrap();
+    let camera = polycam::camera(file, root.to_string().as_bytes(), None).unwrap();
     assert!(camera.center().distance(centre) < 1e-12 && (camera.fx, camera.fy, camera.cy) == (500.0, 501.0, 239.0));
     assert!(camera.ray_direction(320.0, 239.0).distance(axes.z_axis) < 1e-12);
 
@@ -263,15 +269,15 @@ fn polycam_is_read_as_nerfstudio_reads_it() {
     let bad = |name: &str, value: Value| {
         let mut root = root.clone();
         root[name] = value;
-        polycam::camera(file, root.to_string().as_bytes())
+        polycam::camera(file, root.to_string().as_bytes(), None)
     };
     says(bad("t_12", json!("a")), &["1.json", "`t_12`", "a number"]);
     says(bad("t_12", json!(7)), &["rotation"]);
     says(bad("width", json!(640.5)), &["`width`", "640.5"]);
     says(bad("fx", json!(1e-9)), &["focal length"]);
-    says(bad("t_03", json!(1e9)), &["position"]);
-    says(polycam::camera(file, b"[]"), &["an object"]);
-    says(polycam::camera(file, b"{"), &["not JSON"]);
+    says(bad("t_03", json!(1e10)), &["position"]);
+    says(polycam::camera(file, b"[]", None), &["an object"]);
+    says(polycam::camera(file, b"{", None), &["not JSON"]);
 }
 
 #[test]
@@ -293,8 +299,9 @@ fn metashape_is_read() {
         m.join(" ")
     );
     let file = Path::new("x.xml");
-    let (photos, without) = metashape::parse(file, xml.as_bytes()).unwrap();
-    assert_eq!((photos.len(), without, photos[0].label.as_str()), (1, 1, "a.b.png"));
+    let metashape::Export { photos, notes } = metashape::parse(file, xml.as_bytes()).unwrap();
+    assert_eq!((photos.len(), photos[0].label.as_str()), (1, "a.b.png"));
+    assert!(notes.iter().any(|n| n.kind == NoteKind::Dropped && n.contains("1 photos have no pose")), "{notes:?}");
     let c = photos[0].camera;
     assert_eq!((c.fx, c.fy, c.cx, c.cy), (503.0, 500.0, 321.5, 238.0));
     assert!(c.center().distance(centre) < 1e-9 && c.ray_direction(c.cx, c.cy).distance(axes.z_axis) < 1e-9);
@@ -318,6 +325,7 @@ fn metashape_is_read() {
     says(bad("<f>500</f>", "<f>wide</f>"), &["`f`", "wide"]);
     says(bad("sensor_id=\"0\"", "sensor_id=\"7\""), &["camera \"a.b.png\"", "`sensor_id`", "7"]);
     says(bad("</transform>", " 1</transform>"), &["16 numbers", "17"]);
+    says(bad("<b1>3</b1>", "<p3>1</p3>"), &["x.xml", "sensor \"0\"", "`p3`", "not supported"]);
     says(bad("<transform>", "<transform>x"), &["camera", "`transform`"]);
     says(bad("</document>", "</documen>"), &["not XML"]);
     says(bad("<chunk label", "<chunk/><chunk label"), &["one chunk", "2"]);
@@ -327,22 +335,21 @@ fn metashape_is_read() {
 #[test]
 fn realitycapture_is_read() {
     let csv = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n\
-               a.jpg,1,2,3,0,0,0,36,0.5,-0.25,-0.1,0,0,0,0,0\n\
+               a.jpg,1,2,3,0,0,0,36,0.02,-0.01,-0.1,0,0,0,0,0\n\
                b.jpg,1,2,3,90,90,0,36,0,0,0,0,0,0,0,0\n";
     let file = Path::new("x.csv");
     let rows = realitycapture::parse(file, csv.as_bytes()).unwrap();
     let look = |i: usize| {
-        let Intrinsics::Relative { world_to_camera: m, focal, offset } = rows[i].1 else { panic!("no sizes") };
+        let Intrinsics::Relative { world_to_camera: m, focal, offset, upright: false } = rows[i].1 else {
+            panic!("no sizes")
+        };
         let axes = DMat3::from_mat4(m).transpose();
         (axes.z_axis, -axes.y_axis, focal, offset)
     };
     // Straight down, the top to the north.
     let (forward, up, focal, offset) = look(0);
     assert!(forward.distance(-DVec3::Z) < 1e-12 && up.distance(DVec3::Y) < 1e-12);
-    assert_eq!(
-        (focal, offset, rows[0].2),
-        (1.0, [0.5 / 36.0, -0.25 / 36.0], Lens::brown([-0.1, 0.0, 0.0, 0.0], [0.0; 2]))
-    );
+    assert_eq!((focal, offset, rows[0].2), (1.0, [0.02, -0.01], Lens::brown([-0.1, 0.0, 0.0, 0.0], [0.0; 2])));
     // Lifted to the horizon and turned to the east.
     let (forward, up, ..) = look(1);
     assert!(forward.distance(DVec3::X) < 1e-12 && up.distance(DVec3::Z) < 1e-12, "{forward} {up}");
@@ -357,6 +364,12 @@ fn realitycapture_is_read() {
     says(bad("a.jpg,1", "a.jpg,one"), &["line 2", "`x`", "one"]);
     says(bad("a.jpg", ""), &["line 2", "`name`"]);
     says(bad("90,90,0,36", "90,90,0,nan"), &["line 3", "`f`"]);
-    says(bad("0,0,0,0,0,0\n", "0,0,0,0,0.1,0\n"), &["tangential"]);
+    says(bad(",0.02,", ",1.02,"), &["line 2", "`px`", "1.02"]);
+    // Tangential coefficients are OpenCV's; a count may come first.
+    let more = format!("#cameras 2\n{}", csv.replace("0,0,0,0,0,0\n", "0,0,0,0,0.1,0.2\n"));
+    let rows = realitycapture::parse(file, more.as_bytes()).unwrap();
+    assert_eq!(rows[1].2, Lens::brown([0.0; 4], [0.1, 0.2]));
+    let broken = more.replace("a.jpg,1", "a.jpg,one");
+    says(realitycapture::parse(file, broken.as_bytes()), &["line 3", "`x`", "one"]);
     says(realitycapture::parse(file, b"#name,x,y,alt,heading,pitch,roll,f\na.jpg,1\n"), &["line 2", "`y`", "nothing"]);
 }

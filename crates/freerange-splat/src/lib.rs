@@ -19,5 +19,5 @@ pub use cloud::{Cloud, channel};
 pub use error::SplatError;
 pub use merge::{Gaussian, OPACITY_RANGE, merge};
 pub use normalize::{Normalization, STD_FLOOR, Statistics};
-pub use ply::{PlyFile, encode_ply, parse_ply, read_ply, write_ply};
+pub use ply::{PlyFile, encode_ply, parse_ply, ply_origin, read_ply, write_ply, write_ply_at};
 pub use tree::{LodTree, Node};

@@ -118,6 +118,37 @@ pub fn write_ply(cloud: &Cloud, file: &Path) -> Result<(), SplatError> {
     Ok(write_atomically(file, |w| write_to(cloud, w)).map_err(IoError::at(file))?)
 }
 
+/// The words before the numbers of an origin in a file's header.
+const ORIGIN: &str = "comment origin ";
+
+/// As [`write_ply`], with the origin that positions are relative to, where they would be too large for 32 bits, as a comment:
+/// `comment origin X Y Z`.
+///
+/// # Errors
+/// As [`write_ply`].
+pub fn write_ply_at(cloud: &Cloud, origin: Option<[f64; 3]>, file: &Path) -> Result<(), SplatError> {
+    cloud.check_finite()?;
+    let line = origin.map_or(String::new(), |[x, y, z]| format!("{ORIGIN}{x} {y} {z}\n"));
+    Ok(write_atomically(file, |w| write_with(cloud, &line, w)).map_err(IoError::at(file))?)
+}
+
+/// The origin that [`write_ply_at`] wrote into a file; none where there is none, or the file is no `.ply`.
+///
+/// # Errors
+/// [`SplatError::Io`].
+pub fn ply_origin(file: &Path) -> Result<Option<[f64; 3]>, SplatError> {
+    let mut start = Vec::new();
+    File::open(file).and_then(|f| f.take(4096).read_to_end(&mut start)).map_err(IoError::at(file))?;
+    let text = String::from_utf8_lossy(&start);
+    let header =
+        if text.starts_with("ply") { text.lines().take_while(|l| l.trim() != "end_header") } else { return Ok(None) };
+    let numbers = |line: &str| -> Option<[f64; 3]> {
+        let words = line.strip_prefix(ORIGIN)?.split_ascii_whitespace();
+        words.map(|w| w.parse().ok().filter(|v: &f64| v.is_finite())).collect::<Option<Vec<f64>>>()?.try_into().ok()
+    };
+    Ok(header.filter_map(numbers).next())
+}
+
 /// The bytes that [`write_ply`] writes.
 ///
 /// # Errors
@@ -130,7 +161,12 @@ pub fn encode_ply(cloud: &Cloud) -> Result<Vec<u8>, SplatError> {
 }
 
 fn write_to(cloud: &Cloud, w: &mut impl Write) -> io::Result<()> {
-    write!(w, "ply\nformat binary_little_endian 1.0\nelement vertex {}\n", cloud.len())?;
+    write_with(cloud, "", w)
+}
+
+/// `comments`: whole lines of the header.
+fn write_with(cloud: &Cloud, comments: &str, w: &mut impl Write) -> io::Result<()> {
+    write!(w, "ply\nformat binary_little_endian 1.0\n{comments}element vertex {}\n", cloud.len())?;
     for (name, _) in COLUMNS {
         writeln!(w, "property float {name}")?;
     }

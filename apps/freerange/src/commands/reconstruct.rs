@@ -12,11 +12,13 @@ use std::{
 use freerange::{
     Compute, Device, DeviceName, EncoderPlaces, Options, Reconstructor, SampleConfig, Scores, Solver, Stage, View,
     pictures::{on_white, render_view, write_turntable},
-    score, write_ply,
+    score,
 };
 use freerange_camera::image_ops::{sheet, to_picture};
+use freerange_core::Note;
 use freerange_eval::memory::peak_memory;
 use freerange_formats::{Format, Frame, WriteOptions};
+use freerange_splat::write_ply_at;
 use serde::Serialize;
 
 use crate::{
@@ -258,7 +260,11 @@ impl Watch {
 #[derive(Serialize)]
 struct SceneReport {
     scene: PathBuf,
-    notes: Vec<String>,
+    /// What was understood, assumed, changed or left out, and what may make the result wrong.
+    notes: Vec<Note>,
+    /// What was subtracted from all positions of the scene: results are relative to it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    origin: Option<[f64; 3]>,
     sampling: SampleConfig,
     /// Names of the views that the model was shown.
     views_shown: Vec<String>,
@@ -266,7 +272,7 @@ struct SceneReport {
     #[serde(skip_serializing_if = "Vec::is_empty")]
     held_out: Vec<String>,
     gaussians: usize,
-    /// Scale, rotation (x y z w) and translation from the scene's frame to the model's.
+    /// Scale, rotation (x y z w) and translation from the scene's own frame, before `origin` is subtracted, to the model's.
     canonical_from_user: freerange::Similarity,
     samples: Vec<SampleReport>,
     seconds: Vec<(&'static str, f64)>,
@@ -311,7 +317,10 @@ fn run_in(args: &Args, job: &Job) -> Result<(), CliError> {
     let model = args.sampling.open(&device)?;
     let (report, json) = reconstruct(args, path, scene, &model, &args.output, begin, || Ok(()))?;
     match args.json {
-        true => println!("{json}"),
+        true => {
+            tell(&report.notes);
+            println!("{json}");
+        }
         false => print(&report, &args.output),
     }
     Ok(())
@@ -328,10 +337,12 @@ fn reconstruct(
     begin: Instant,
     commit: impl FnOnce() -> Result<(), CliError>,
 ) -> Result<(SceneReport, String), CliError> {
+    let warnings = scene.warnings(model)?;
+    let origin = Some(scene.cameras.origin).filter(|o| *o != glam::DVec3::ZERO).map(|o| o.to_array());
     let mut inputs = scene.loaded.views;
     let mut further = scene.loaded.further;
     if let Some(path) = &args.validate {
-        further.extend(Photos::further(path)?);
+        further.extend(Photos::further(path, scene.cameras.origin)?);
     }
     let held = args.holdout.as_ref().map(|h| h.take(&mut inputs)).transpose()?.unwrap_or_default();
     let held_out = held.iter().map(|v| v.name.clone()).collect();
@@ -355,17 +366,18 @@ fn reconstruct(
     let up = result.canonical_from_user.rotation.inverse() * glam::DVec3::Z;
     let frame = Frame::with_up(up).unwrap_or_default();
     let mut notes = scene.notes;
+    notes.extend(warnings);
     let mut samples = Vec::new();
     for (i, sample) in result.samples.iter().enumerate() {
         let suffix = if i == 0 { String::new() } else { format!("-{i}") };
         let file = format!("gaussians{suffix}.ply");
-        write_ply(&sample.gaussians, &output.path(&file)?)?;
+        write_ply_at(&sample.gaussians, origin, &output.path(&file)?)?;
         for format in args.format.iter().filter(|f| **f != Format::Ply) {
             let name = if *format == Format::Html { "view" } else { "gaussians" };
             let options = WriteOptions { frame, ..WriteOptions::default() };
             let path = output.path(&format!("{name}{suffix}.{format}"))?;
             let lost = freerange_formats::write(&sample.gaussians, &path, &options)?;
-            notes.extend(lost.into_iter().map(|note| format!("{name}{suffix}.{format}: {note}")));
+            notes.extend(lost.into_iter().map(|note| Note::dropped(format!("{name}{suffix}.{format}: {note}"))));
         }
         write_turntable(&output.path(&format!("turntable{suffix}.gif"))?, &sample.canonical, 48, 256)?;
         for (view, picture) in comparisons(&sample.gaussians, &inputs)? {
@@ -385,15 +397,16 @@ fn reconstruct(
     }
     seconds.push(("write", begin.elapsed().as_secs_f64()));
 
-    notes.extend(result.notes);
+    notes.extend(result.notes.into_iter().map(Note::understood));
     let report = SceneReport {
         scene: path.into(),
         notes,
+        origin,
         sampling: options.sample,
         views_shown: result.shown.iter().map(|&i| inputs[i].name.clone()).collect(),
         held_out,
         gaussians: result.samples.first().map_or(0, |s| s.gaussians.len()),
-        canonical_from_user: result.canonical_from_user,
+        canonical_from_user: in_scene(&result.canonical_from_user, origin),
         samples,
         seconds,
         peak_memory_bytes: peak_memory(),
@@ -403,6 +416,15 @@ fn reconstruct(
     commit()?;
     output.commit()?;
     Ok((report, json))
+}
+
+/// A transform from positions relative to `origin`, for positions as the scene has them.
+fn in_scene(from_local: &freerange::Similarity, origin: Option<[f64; 3]>) -> freerange::Similarity {
+    let shift = freerange::Similarity {
+        translation: -glam::DVec3::from_array(origin.unwrap_or_default()),
+        ..freerange::Similarity::IDENTITY
+    };
+    from_local.after(&shift)
 }
 
 /// Each input image beside its render.
@@ -419,10 +441,13 @@ fn comparisons(cloud: &freerange::Cloud, views: &[View]) -> Result<Vec<(String, 
         .collect()
 }
 
+/// Notes and warnings, on standard error.
+fn tell(notes: &[Note]) {
+    notes.iter().for_each(|note| eprintln!("{note}"));
+}
+
 fn print(report: &SceneReport, output: &Path) {
-    for note in &report.notes {
-        println!("note: {note}");
-    }
+    tell(&report.notes);
     for sample in &report.samples {
         println!("{} ({} Gaussians, seed {})", output.join(&sample.file).display(), report.gaussians, sample.seed);
         let line = |what: &str, scores: &Option<Scores>| {

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use freerange::pictures::render_view;
 use freerange_camera::{image_ops::to_picture, load_cameras};
 use freerange_formats::{Frame, Loaded, read};
+use freerange_splat::ply_origin;
 
 use crate::{error::CliError, output::OutputFolder, progress::Progress};
 
@@ -29,7 +30,11 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     for note in notes {
         eprintln!("note: {note}");
     }
-    let cameras = load_cameras(&args.cameras)?;
+    let mut cameras = load_cameras(&args.cameras)?;
+    // Positions in the file may be relative to an origin.
+    if let Some(origin) = ply_origin(&args.file)? {
+        cameras.iter_mut().for_each(|(_, camera)| *camera = camera.relative_to(origin.into()));
+    }
     let output = OutputFolder::create("render", &args.output)?;
     let mut bar = Progress::new("rendering", cameras.len() as u64);
     for (i, (name, camera)) in cameras.iter().enumerate() {

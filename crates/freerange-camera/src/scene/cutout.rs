@@ -112,13 +112,13 @@ fn backdrop(image: &RgbaImage, shown: &[bool]) -> Result<Backdrop, String> {
     let seeds: Vec<(u32, u32)> = border.iter().copied().filter(|&(x, y)| near(image.get_pixel(x, y), colour)).collect();
     let share = seeds.len() as f64 / border.len() as f64;
     if share < BORDER_SHARE {
-        return Err(format!("a border of which only {:.0} % has one colour", 100.0 * share));
+        return Err(format!("a border of which only {:.0} % has one color", 100.0 * share));
     }
     let reached = flood(w, h, &seeds, |x, y| shown[index(x, y)] && near(image.get_pixel(x, y), colour));
     let depth: Vec<u8> = reached.iter().zip(shown).map(|(r, s)| if *r || !s { 0 } else { u8::MAX }).collect();
     let object = depth.iter().filter(|d| **d != 0).count();
     if (object as f64) < SMALLEST_OBJECT * depth.len() as f64 {
-        return Err(format!("nothing but the colour {colour:?}"));
+        return Err(format!("nothing but the color {colour:?}"));
     }
     Ok(Backdrop { colour, depth })
 }

@@ -3,9 +3,10 @@
 //! Written after the format's documentation; points, rigs and frames are not read. Poses are world to camera with OpenCV's axes,
 //! pixel centres lie at +0.5, numbers in binary files are little-endian.
 
-use super::{Cameras, Format, Intrinsics, Photo, bytes_of, coefficients, find_image, pinhole, rigid, text_of};
+use super::{Cameras, Format, Intrinsics, Photo, Photos, bytes_of, coefficients, pinhole, rigid, text_of};
 use crate::{SceneError, error::In};
 use freerange_camera::Lens;
+use freerange_core::Note;
 use glam::{DMat3, DQuat, DVec3};
 use std::{
     collections::{HashMap, HashSet},
@@ -249,14 +250,19 @@ pub fn cameras_text(file: &Path, bytes: &[u8]) -> Result<HashMap<u32, ColmapCame
     Ok(cameras)
 }
 
-/// Reads `images.txt`: two lines for each image, the second (keypoints, maybe empty) passed over.
+/// Reads `images.txt`: two lines for each image, the second (keypoints, maybe empty, or not there at all) passed over.
 pub fn images_text(file: &Path, bytes: &[u8]) -> Result<Vec<ColmapImage>, SceneError> {
     let mut images = Vec::new();
-    let mut lines = text_of(file, bytes)?.lines().enumerate();
-    while let Some((i, line)) = lines.next() {
+    // Whether the last image's keypoints may still come.
+    let mut keypoints = false;
+    for (i, line) in text_of(file, bytes)?.lines().enumerate() {
         let place = format!("line {}", i + 1);
         let line = line.trim();
         if line.is_empty() || line.starts_with('#') {
+            keypoints &= !line.is_empty();
+            continue;
+        }
+        if std::mem::take(&mut keypoints) && are_keypoints(line) {
             continue;
         }
         let mut rest = line;
@@ -276,9 +282,16 @@ pub fn images_text(file: &Path, bytes: &[u8]) -> Result<Vec<ColmapImage>, SceneE
         let camera = number(file, &place, "CAMERA_ID", word())?;
         // The rest of the line: names may contain spaces.
         images.push(image(file, &place, q, t, camera, rest.trim().to_owned())?);
-        lines.next();
+        keypoints = true;
     }
     Ok(images)
+}
+
+/// Whether a line may be an image's keypoints: x, y and the number of a point, -1 or a whole one, each.
+fn are_keypoints(line: &str) -> bool {
+    let words: Vec<&str> = line.split_ascii_whitespace().collect();
+    let point = |p: &[&str]| p[0].parse::<f64>().is_ok() && p[1].parse::<f64>().is_ok() && p[2].parse::<i64>().is_ok();
+    words.len() % 3 == 0 && words.chunks_exact(3).all(point)
 }
 
 /// Both files of a model in `folder`, binary before text.
@@ -310,8 +323,15 @@ pub(super) fn look_for(scene: &Path) -> Result<Option<PathBuf>, SceneError> {
     Ok(numbered.into_iter().chain([sparse, scene.to_path_buf()]).find(|folder| files(folder).is_some()))
 }
 
-/// Reads the model in `folder`. Images are looked for in `images_in`, or in `images` beside the model or up to two folders above, else right
-/// there.
+/// The scene that a model's folder belongs to: the folder above `sparse`, else its own.
+pub(super) fn scene_of(model: &Path) -> &Path {
+    let named = |folder: &Path, name: &str| folder.file_name().is_some_and(|n| n == name);
+    let above = model.ancestors().take(2).find(|f| named(f, "sparse")).and_then(Path::parent);
+    above.unwrap_or(model)
+}
+
+/// Reads the model in `folder`. Images are looked for in `images_in`, else in `images` of the scene or beside the model, else in their
+/// folders themselves.
 pub(super) fn read(folder: &Path, images_in: Option<&Path>) -> Result<Cameras, SceneError> {
     let [cameras_file, images_file] = files(folder).ok_or_else(|| {
         In(folder).malformed("", "expected cameras.bin and images.bin, or cameras.txt and images.txt, in this folder")
@@ -322,38 +342,41 @@ pub(super) fn read(folder: &Path, images_in: Option<&Path>) -> Result<Cameras, S
         true => (cameras_binary(&cameras_file, &camera_bytes)?, images_binary(&images_file, &image_bytes)?),
         false => (cameras_text(&cameras_file, &camera_bytes)?, images_text(&images_file, &image_bytes)?),
     };
+    drop((camera_bytes, image_bytes));
     images.sort_by(|a, b| a.name.cmp(&b.name));
     let absolute = std::fs::canonicalize(folder).map_err(|e| In(folder).read(e))?;
-    let above: Vec<&Path> = absolute.ancestors().take(3).collect();
-    let mut folders: Vec<PathBuf> = above.iter().map(|f| f.join("images")).filter(|f| f.is_dir()).collect();
-    folders.extend(above.iter().map(|f| f.to_path_buf()));
+    let scene = scene_of(&absolute);
+    let within: Vec<&Path> = absolute.ancestors().take_while(|f| f.starts_with(scene)).collect();
+    let mut folders: Vec<PathBuf> = within.iter().map(|f| f.join("images")).filter(|f| f.is_dir()).collect();
+    folders.extend(within.iter().map(|f| f.to_path_buf()));
     if let Some(images) = images_in {
         folders = vec![images.to_path_buf()];
     }
+    let mut found = Photos::new(&images_file, folders);
     let mut names = HashSet::new();
-    let photos = images
-        .into_iter()
-        .map(|i| {
-            let place = format!("image {:?}", i.name);
-            let camera = cameras
-                .get(&i.camera)
-                .ok_or_else(|| In(&images_file).field(&place, "CAMERA_ID", "a camera of the cameras file", i.camera))?;
-            if !names.insert(i.name.clone()) {
-                return Err(In(&images_file).field(&place, "NAME", "a name of its own", "another image with it"));
-            }
-            let rotation = DMat3::from_quat(i.rotation);
-            let centre = -(rotation.transpose() * i.translation);
-            let pose = rigid(&images_file, &place, rotation, i.translation, centre)?;
-            let place = format!("camera {}", i.camera);
-            let pixels = pinhole(&cameras_file, &place, camera.size, camera.focal, camera.principal, pose)?;
-            let image = find_image(&images_file.display().to_string(), &i.name, &folders)?;
-            let intrinsics = Intrinsics::Pixels(pixels);
-            Ok(Photo { name: i.name, image, mask: None, intrinsics, lens: camera.lens, further: false })
-        })
-        .collect::<Result<Vec<_>, SceneError>>()?;
-    let mut notes = Vec::new();
-    if binary && folder.join("cameras.txt").is_file() {
-        notes.push(format!("{}: the binary files are read, not the text files beside them", folder.display()));
+    let mut photos = Vec::with_capacity(images.len());
+    for i in images {
+        let place = format!("image {:?}", i.name);
+        let camera = cameras
+            .get(&i.camera)
+            .ok_or_else(|| In(&images_file).field(&place, "CAMERA_ID", "a camera of the cameras file", i.camera))?;
+        if !names.insert(i.name.clone()) {
+            return Err(In(&images_file).field(&place, "NAME", "a name of its own", "another image with it"));
+        }
+        let rotation = DMat3::from_quat(i.rotation);
+        let centre = -(rotation.transpose() * i.translation);
+        let pose = rigid(&images_file, &place, rotation, i.translation, centre)?;
+        let place = format!("camera {}", i.camera);
+        let pixels = pinhole(&cameras_file, &place, camera.size, camera.focal, camera.principal, pose)?;
+        let Some(image) = found.find(&i.name)? else { continue };
+        let intrinsics = Intrinsics::Pixels(pixels);
+        photos.push(Photo { name: i.name, image, mask: None, intrinsics, lens: camera.lens, further: false });
     }
-    Ok(Cameras { format: Format::Colmap, photos, files: vec![cameras_file, images_file], notes })
+    let mut notes = Vec::new();
+    found.finish(&mut notes)?;
+    if binary && folder.join("cameras.txt").is_file() {
+        let text = format!("{}: the binary files are read, not the text files beside them", folder.display());
+        notes.push(Note::dropped(text));
+    }
+    Ok(Cameras::new(Format::Colmap, photos, vec![cameras_file, images_file], notes))
 }

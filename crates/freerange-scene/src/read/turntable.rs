@@ -1,8 +1,9 @@
 //! Photos at even steps around an object, taken without poses.
 
 use super::{Cameras, Format, IMAGES, Intrinsics, Photo, entries, has_extension};
-use crate::SceneError;
-use freerange_camera::{Camera, Lens};
+use crate::{SceneError, error::In};
+use freerange_camera::{Camera, Lens, scene::unreadable_kind};
+use freerange_core::Note;
 use glam::DVec3;
 use std::{path::Path, str::FromStr};
 
@@ -49,6 +50,9 @@ pub(super) fn read(folder: &Path, turntable: &Turntable) -> Result<Cameras, Scen
     let mut images: Vec<_> =
         entries(&folder)?.into_iter().filter(|p| p.is_file() && has_extension(p, &IMAGES)).collect();
     if images.len() < 3 {
+        if let Some((file, kind)) = entries(&folder)?.iter().find_map(|f| Some((f, unreadable_kind(f)?))) {
+            return Err(In(file).unreadable(kind));
+        }
         return Err(SceneError::TooFew { file: folder, expected: 3, found: images.len() });
     }
     images.sort_by_cached_key(|p| by_value(&p.file_name().unwrap_or_default().to_string_lossy()));
@@ -69,19 +73,19 @@ pub(super) fn read(folder: &Path, turntable: &Turntable) -> Result<Cameras, Scen
                 name: image.file_name().unwrap_or_default().to_string_lossy().into_owned(),
                 image,
                 mask: None,
-                intrinsics: Intrinsics::Relative { focal, offset: [0.0; 2], world_to_camera },
+                intrinsics: Intrinsics::Relative { focal, offset: [0.0; 2], world_to_camera, upright: true },
                 lens: Lens::Ideal,
                 further: false,
             }
         })
         .collect();
     let way = if turntable.clockwise { "clockwise" } else { "counterclockwise" };
-    let notes = vec![format!(
+    let notes = vec![Note::assumed(format!(
         "{count} photos in order of their names are taken as one {way} turn of the object in even steps of {:.1} degrees; \
          sizes are relative to the cameras' distance, {DISTANCE}",
         360.0 / count as f64
-    )];
-    Ok(Cameras { format: Format::Turntable, photos, files: vec![folder], notes })
+    ))];
+    Ok(Cameras::new(Format::Turntable, photos, vec![folder], notes))
 }
 
 /// A name cut into texts and numbers, so that `9` comes before `10`.
