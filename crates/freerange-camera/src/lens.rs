@@ -95,8 +95,8 @@ impl Lens {
             Self::Eucm { alpha, beta } => {
                 let distance = (beta * ray.truncate().length_squared() + ray.z * ray.z).sqrt();
                 let depth = alpha * distance + (1.0 - alpha) * ray.z;
-                // Rays behind this plane appear where others do.
-                let least = if alpha > 0.5 { (alpha - 1.0) / (2.0 * alpha - 1.0) } else { -alpha / (1.0 - alpha) };
+                // Rays farther behind appear where others do (Usenko et al. 2018, for the unified model).
+                let least = -if alpha > 0.5 { (1.0 - alpha) / alpha } else { alpha / (1.0 - alpha) };
                 (depth > 1e-12 * distance && ray.z > least * distance).then(|| ray.truncate() / depth)?
             }
             Self::Equirectangular => {

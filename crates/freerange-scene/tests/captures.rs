@@ -729,3 +729,79 @@ fn polycams_files_without_sizes_are_read() {
         assert_right(&capture.load().unwrap(), 4);
     }
 }
+
+/// A model of wide lenses whose axes are turned away from the ball by so many degrees, and its photos.
+fn wide(model: &str, params: &str, lens: Lens, away: f64, behind: [u8; 4]) -> Capture {
+    let capture = Capture::new();
+    let (side, half) = (400.0, 200.0);
+    let focal = if lens == Lens::Equirectangular { side / std::f64::consts::TAU } else { 105.0 };
+    let down = if lens == Lens::Equirectangular { side / std::f64::consts::PI } else { focal };
+    let (mut c, mut i) = (String::new(), String::new());
+    for k in 0..4 {
+        let turn = DMat4::from_rotation_y(away.to_radians());
+        let pose = turn * camera(k, 4).world_to_camera;
+        let pinhole = Camera { world_to_camera: pose, ..camera(k, 4) };
+        let back = DMat3::from_mat4(pose).transpose();
+        let image = RgbaImage::from_fn(400, 400, |x, y| {
+            let (u, v) = ((f64::from(x) + 0.5 - half) / focal, (f64::from(y) + 0.5 - half) / down);
+            let ray = lens.ray(u, v).map(|r| back * r);
+            let hit = ray.is_some_and(|r| pinhole.center().cross(r).length() < BALL && r.dot(pinhole.center()) < 0.0);
+            Rgba(if hit { [200, 30, 20, 255] } else { behind })
+        });
+        image.save(capture.at(&format!("images/{k}.png"))).unwrap();
+        let (q, t) = (glam::DQuat::from_mat3(&DMat3::from_mat4(pose)), pose.w_axis.truncate());
+        c += &format!("{k} {model} 400 400 {params}\n");
+        i += &format!("{k} {} {} {} {} {} {} {} {k} {k}.png\n\n", q.w, q.x, q.y, q.z, t.x, t.y, t.z);
+    }
+    std::fs::write(capture.at("sparse/0/cameras.txt"), c).unwrap();
+    std::fs::write(capture.at("sparse/0/images.txt"), i).unwrap();
+    capture
+}
+
+#[test]
+fn wide_lenses_are_seen_by_a_pinhole_that_looks_at_the_object() {
+    let fisheye = Lens::Fisheye { k: [0.01, 0.0, 0.0, 0.0] };
+    let eucm = Lens::Eucm { alpha: 0.6, beta: 1.1 };
+    for (model, params, lens) in [
+        ("SIMPLE_RADIAL_FISHEYE", "105 200 200 0.01", fisheye),
+        ("EUCM", "105 105 200 200 0.6 1.1", eucm),
+        ("EQUIRECTANGULAR", "400 400", Lens::Equirectangular),
+    ] {
+        for away in [0.0, 40.0, 75.0, 160.0] {
+            if away > 90.0 && lens != Lens::Equirectangular {
+                continue;
+            }
+            let capture = wide(model, params, lens, away, [0; 4]);
+            let loaded = capture.load().unwrap();
+            assert_eq!(loaded.masks, MaskKind::Alpha);
+            for view in &loaded.views {
+                let seen = view.image.pixels().filter(|p| p[3] >= 128).count();
+                assert!(wrong(view) < 0.02 && seen > 250, "{model}, {away}: {:.3} {seen}", wrong(view));
+                // Nothing of it is cut off.
+                let (w, h) = view.image.dimensions();
+                let border =
+                    view.image.enumerate_pixels().filter(|(x, y, _)| *x == 0 || *y == 0 || *x == w - 1 || *y == h - 1);
+                assert!(border.into_iter().all(|(.., p)| p[3] < 128), "{model}, {away}");
+            }
+            // Masks go back to the photos' own pixels.
+            let out = tempfile::tempdir().unwrap();
+            let written = freerange_scene::write_masks(out.path(), &capture.read(), &loaded).unwrap();
+            let truth = image::open(capture.at("images/0.png")).unwrap().into_rgba8();
+            let mask = image::open(&written[0]).unwrap().into_luma8();
+            let (both, either) = mask.pixels().zip(truth.pixels()).fold((0, 0), |(both, either), (m, t)| {
+                let (m, t) = (m[0] >= 128, t[3] >= 128);
+                (both + u32::from(m && t), either + u32::from(m || t))
+            });
+            assert!(f64::from(both) > 0.85 * f64::from(either), "{model}, {away}: {both} of {either}");
+        }
+    }
+    // Before a plain background, from where all of it is known.
+    let capture = wide("SIMPLE_RADIAL_FISHEYE", "105 200 200 0.01", fisheye, 60.0, WHITE);
+    let hints = Hints { center: Some(DVec3::ZERO), radius: Some(BALL), others: None };
+    let loaded = load(&capture.read(), &LoadConfig { hints, ..LoadConfig::default() }).unwrap();
+    tells(&loaded.notes, NoteKind::Changed, &["4 photos of wide lenses", "looks at the object"]);
+    assert!(loaded.views.iter().all(|v| wrong(v) < 0.02));
+    // All around, and nothing says where the object is.
+    let capture = wide("EQUIRECTANGULAR", "400 400", Lens::Equirectangular, 0.0, WHITE);
+    says(capture.load(), &["camera model", "--center X,Y,Z", "all around"]);
+}

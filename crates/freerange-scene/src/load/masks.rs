@@ -28,7 +28,7 @@ const FOLDERS: [&str; 3] = ["masks", "mask", "image_masks"];
 /// Share of a mask's border from which it is no outline of something within the photo.
 const ALONG_BORDER: f64 = 0.5;
 /// The same from which it may be the negative of one.
-const ALL_ALONG_BORDER: f64 = 0.9;
+const ALL_ALONG_BORDER: f64 = 0.98;
 /// Mean agreement with their common hull from which black parts of masks are the object.
 const ONE_OBJECT: f64 = 0.8;
 

@@ -34,7 +34,6 @@ const MODELS: [&str; 18] = [
     "EUCM",
     "EQUIRECTANGULAR",
 ];
-const ADVICE: &str = "undistort the images first (colmap image_undistorter)";
 
 /// A camera: size, focal lengths, principal point, lens.
 #[derive(Clone, Debug, PartialEq)]
@@ -62,40 +61,65 @@ pub struct ColmapImage {
     pub name: String,
 }
 
-/// How many parameters the models have that are read; none for the others.
+/// How many parameters a model has.
 fn parameter_count(model: &str) -> Option<usize> {
     Some(match model {
-        "SIMPLE_PINHOLE" => 3,
-        "PINHOLE" | "SIMPLE_RADIAL" => 4,
-        "RADIAL" => 5,
+        "EQUIRECTANGULAR" => 2,
+        "SIMPLE_PINHOLE" | "SIMPLE_FISHEYE" => 3,
+        "PINHOLE" | "SIMPLE_RADIAL" | "SIMPLE_RADIAL_FISHEYE" | "SIMPLE_DIVISION" | "FISHEYE" => 4,
+        "RADIAL" | "RADIAL_FISHEYE" | "FOV" | "DIVISION" => 5,
+        "EUCM" => 6,
         "OPENCV" | "OPENCV_FISHEYE" => 8,
-        "FULL_OPENCV" => 12,
+        "FULL_OPENCV" | "THIN_PRISM_FISHEYE" => 12,
+        "RAD_TAN_THIN_PRISM_FISHEYE" => 16,
         _ => return None,
     })
 }
 
+/// Whether a model has one focal length for both axes.
+fn has_one_focal(model: &str) -> bool {
+    model.starts_with("SIMPLE_") || ["RADIAL", "RADIAL_FISHEYE"].contains(&model)
+}
+
 fn camera(file: &Path, place: &str, model: &str, size: (u64, u64), p: &[f64]) -> Result<ColmapCamera, SceneError> {
-    let expected = parameter_count(model).ok_or_else(|| match MODELS.contains(&model) {
-        true => In(file).unsupported(place, format!("the camera model {model}"), ADVICE),
-        false => In(file).field(place, "model", "the name of a camera model", format!("{model:?}")),
-    })?;
+    let expected = parameter_count(model)
+        .ok_or_else(|| In(file).field(place, "model", "the name of a camera model", format!("{model:?}")))?;
     if p.len() != expected {
         return Err(In(file).field(place, "params", &format!("{expected} numbers for {model}"), p.len()));
     }
-    let (focal, c) = match model {
-        "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL" => ([p[0], p[0]], 1),
-        _ => ([p[0], p[1]], 2),
-    };
+    if model == "EQUIRECTANGULAR" {
+        // All around, whatever the parameters: they are width and height again.
+        let (w, h) = (size.0 as f64, size.1 as f64);
+        let focal = [w / std::f64::consts::TAU, h / std::f64::consts::PI];
+        return Ok(ColmapCamera { size, focal, principal: [0.5 * w, 0.5 * h], lens: Lens::Equirectangular });
+    }
+    let (focal, c) = if has_one_focal(model) { ([p[0], p[0]], 1) } else { ([p[0], p[1]], 2) };
     let k = &p[c + 2..];
-    coefficients(file, place, &["k1", "k2 or k1", "p1", "p2", "k3", "k4", "k5", "k6"], k)?;
+    coefficients(file, place, &["distortion"; 12], k)?;
     let lens = match (model, k) {
         ("SIMPLE_RADIAL", &[k1]) => Lens::brown([k1, 0.0, 0.0, 0.0], [0.0; 2]),
         ("RADIAL", &[k1, k2]) => Lens::brown([k1, k2, 0.0, 0.0], [0.0; 2]),
         ("OPENCV", &[k1, k2, p1, p2]) => Lens::brown([k1, k2, 0.0, 0.0], [p1, p2]),
-        ("OPENCV_FISHEYE", &[k1, k2, k3, k4]) => Lens::Fisheye { k: [k1, k2, k3, k4] },
         ("FULL_OPENCV", &[k1, k2, p1, p2, k3, d1, d2, d3]) => {
             Lens::Brown { k: [k1, k2, k3, 0.0], d: [d1, d2, d3], p: [p1, p2] }
         }
+        ("SIMPLE_FISHEYE" | "FISHEYE", _) => Lens::Fisheye { k: [0.0; 4] },
+        ("SIMPLE_RADIAL_FISHEYE", &[k1]) => Lens::Fisheye { k: [k1, 0.0, 0.0, 0.0] },
+        ("RADIAL_FISHEYE", &[k1, k2]) => Lens::Fisheye { k: [k1, k2, 0.0, 0.0] },
+        ("OPENCV_FISHEYE", &[k1, k2, k3, k4]) => Lens::Fisheye { k: [k1, k2, k3, k4] },
+        ("THIN_PRISM_FISHEYE", &[k1, k2, p1, p2, k3, k4, sx1, sy1]) => {
+            Lens::ThinPrism { k: [k1, k2, k3, k4], p: [p1, p2], s: [sx1, sy1] }
+        }
+        ("RAD_TAN_THIN_PRISM_FISHEYE", &[k0, k1, k2, k3, k4, k5, p0, p1, s0, s1, s2, s3]) => {
+            Lens::Aria { k: [k0, k1, k2, k3, k4, k5], p: [p0, p1], s: [s0, s1, s2, s3] }
+        }
+        ("SIMPLE_DIVISION" | "DIVISION", &[0.0]) => Lens::Ideal,
+        ("SIMPLE_DIVISION" | "DIVISION", &[k]) => Lens::Division { k },
+        ("FOV", &[omega]) if omega.abs() < 1e-6 => Lens::Ideal,
+        ("FOV", &[omega]) if (0.0..std::f64::consts::PI).contains(&omega) => Lens::Fov { omega },
+        ("FOV", &[omega]) => return Err(In(file).field(place, "omega", "an angle from 0 to pi", omega)),
+        ("EUCM", &[alpha, beta]) if (0.0..=1.0).contains(&alpha) && beta > 0.0 => Lens::Eucm { alpha, beta },
+        ("EUCM", _) => return Err(In(file).field(place, "alpha, beta", "0 to 1, and above 0", format!("{k:?}"))),
         _ => Lens::Ideal,
     };
     Ok(ColmapCamera { size, focal, principal: [p[c], p[c + 1]], lens })
