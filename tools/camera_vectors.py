@@ -76,6 +76,25 @@ def model(out, name, params):
     return {"points": points, "images": images}
 
 
+def rig(out):
+    """A model of a rig with two cameras that stand apart, and where points appear in its images."""
+    pycolmap.set_random_seed(3)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 2, 2
+    options.num_points3D, options.num_points2D_without_point3D = 3, 0
+    options.camera_width, options.camera_height = 640, 480
+    options.sensor_from_rig_translation_stddev, options.sensor_from_rig_rotation_stddev = 0.3, 10.0
+    made = pycolmap.synthesize_dataset(options)
+    folder = out / "rig"
+    folder.mkdir(parents=True)
+    made.write_binary(folder)
+    made.write_text(folder)
+    for file in folder.iterdir():
+        if file.stem == "points3D":
+            file.unlink()
+    return {image.name: image.projection_center().tolist() for image in made.images.values()}
+
+
 def lenses():
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.7, 0.7, (12, 2))
@@ -95,7 +114,8 @@ def main():
     names = sorted(n for n in pycolmap.CameraModelId.__members__ if n != "INVALID")
     assert names == sorted(READ), names
     models = {name: model(out, name, READ[name]) for name in READ}
-    expected = {"pycolmap": pycolmap.__version__, "models": models, "rays": {name: grid(name) for name in READ}, "lenses": lenses()}
+    expected = {"pycolmap": pycolmap.__version__, "models": models, "rays": {name: grid(name) for name in READ}, "rig": rig(out),
+                "lenses": lenses()}
     (out / "expected.json").write_text(json.dumps(expected, separators=(",", ":")) + "\n")
 
 

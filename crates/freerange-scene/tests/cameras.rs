@@ -113,6 +113,44 @@ fn lenses_show_rays_where_pycolmap_does_and_lead_back() {
 }
 
 #[test]
+fn rigs_are_read_and_compared_with_images() {
+    let expected = expected();
+    for extension in ["bin", "txt"] {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        std::fs::create_dir_all(at("images")).unwrap();
+        for name in ["cameras", "images", "rigs", "frames"] {
+            let name = format!("{name}.{extension}");
+            std::fs::copy(golden("rig").join(&name), at(&name)).unwrap();
+        }
+        let centers = expected["rig"].as_object().unwrap();
+        for name in centers.keys() {
+            image::RgbImage::new(640, 480).save(at("images").join(name)).unwrap();
+        }
+        let found = cameras(folder.path(), None, None).unwrap();
+        assert_eq!((found.photos.len(), found.notes.len()), (4, 0), "{:?}", found.notes);
+        for photo in &found.photos {
+            let center = photo.camera((640, 480)).unwrap().center();
+            assert!(center.distance(DVec3::from_slice(&numbers(&centers[&photo.name]))) < 1e-9);
+        }
+        // Frames that a script has moved, and broken ones.
+        let mut frames = std::fs::read(at(&format!("frames.{extension}"))).unwrap();
+        match extension {
+            "bin" => {
+                let z = 8 + 8 + 48;
+                frames[z..z + 8].copy_from_slice(&15f64.to_le_bytes());
+            }
+            _ => frames = String::from_utf8(frames).unwrap().replacen(" 0 5 2 ", " 0 15 2 ", 1).into_bytes(),
+        }
+        std::fs::write(at(&format!("frames.{extension}")), &frames).unwrap();
+        let notes = cameras(folder.path(), None, None).unwrap().notes;
+        assert!(notes.iter().any(|n| n.kind == NoteKind::Warning && n.contains("2 of 4 images")), "{notes:?}");
+        std::fs::write(at(&format!("frames.{extension}")), &frames[..frames.len() - 9]).unwrap();
+        says(cameras(folder.path(), None, None), &[&format!("frames.{extension}")]);
+    }
+}
+
+#[test]
 fn lenses_agree_with_opencv_and_can_be_inverted() {
     let truth = &expected()["lenses"];
     let b = numbers(&truth["brown"]);

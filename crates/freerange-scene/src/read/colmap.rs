@@ -1,9 +1,12 @@
 //! COLMAP's sparse models: `cameras` and `images`, binary or text.
 //!
-//! Written after the format's documentation; points, rigs and frames are not read. Poses are world to camera with OpenCV's axes,
+//! Written after the format's documentation; points are not read, rigs and frames compared with.
+//! Poses are world to camera with OpenCV's axes,
 //! pixel centres lie at +0.5, numbers in binary files are little-endian.
 
-use super::{Cameras, Format, Intrinsics, Photo, Photos, bytes_of, coefficients, pinhole, rigid, text_of};
+use super::{
+    Cameras, Format, Intrinsics, Photo, Photos, bytes_of, coefficients, colmap_frames, pinhole, rigid, text_of,
+};
 use crate::{SceneError, error::In};
 use freerange_camera::Lens;
 use freerange_core::Note;
@@ -51,6 +54,8 @@ pub struct ColmapCamera {
 /// A posed image.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ColmapImage {
+    /// Its number.
+    pub id: u32,
     /// Unit quaternion of the rotation from world to camera.
     pub rotation: DQuat,
     /// Translation from world to camera.
@@ -128,6 +133,7 @@ fn camera(file: &Path, place: &str, model: &str, size: (u64, u64), p: &[f64]) ->
 fn image(
     file: &Path,
     place: &str,
+    id: u32,
     q: [f64; 4],
     t: [f64; 3],
     camera: u32,
@@ -142,17 +148,25 @@ fn image(
     if name.is_empty() {
         return Err(In(file).field(place, "NAME", "a file name", "nothing"));
     }
-    Ok(ColmapImage { rotation: rotation.normalize(), translation: DVec3::from_array(t), camera, name })
+    Ok(ColmapImage { id, rotation: rotation.normalize(), translation: DVec3::from_array(t), camera, name })
 }
 
 /// What is left of a binary file.
-struct Bytes<'a> {
+pub(super) struct Bytes<'a> {
     file: &'a Path,
     all: &'a [u8],
     at: usize,
 }
 
 impl<'a> Bytes<'a> {
+    pub fn new(file: &'a Path, all: &'a [u8]) -> Self {
+        Self { file, all, at: 0 }
+    }
+
+    pub fn u8(&mut self, place: &str) -> Result<u8, SceneError> {
+        Ok(self.array::<1>(place)?[0])
+    }
+
     fn take(&mut self, count: u64, place: &str) -> Result<&'a [u8], SceneError> {
         let left = self.all.len() - self.at;
         if count > left as u64 {
@@ -170,15 +184,15 @@ impl<'a> Bytes<'a> {
         Ok(out)
     }
 
-    fn u32(&mut self, place: &str) -> Result<u32, SceneError> {
+    pub fn u32(&mut self, place: &str) -> Result<u32, SceneError> {
         Ok(u32::from_le_bytes(self.array(place)?))
     }
 
-    fn u64(&mut self, place: &str) -> Result<u64, SceneError> {
+    pub fn u64(&mut self, place: &str) -> Result<u64, SceneError> {
         Ok(u64::from_le_bytes(self.array(place)?))
     }
 
-    fn f64s<const N: usize>(&mut self, place: &str) -> Result<[f64; N], SceneError> {
+    pub fn f64s<const N: usize>(&mut self, place: &str) -> Result<[f64; N], SceneError> {
         let mut out = [0.0; N];
         for v in &mut out {
             *v = f64::from_le_bytes(self.array(place)?);
@@ -205,7 +219,7 @@ impl<'a> Bytes<'a> {
 
 /// Reads `cameras.bin`: cameras by number.
 pub fn cameras_binary(file: &Path, bytes: &[u8]) -> Result<HashMap<u32, ColmapCamera>, SceneError> {
-    let mut bytes = Bytes { file, all: bytes, at: 0 };
+    let mut bytes = Bytes::new(file, bytes);
     let count = bytes.u64("number of cameras")?;
     let mut cameras = HashMap::new();
     for i in 0..count {
@@ -229,16 +243,16 @@ pub fn cameras_binary(file: &Path, bytes: &[u8]) -> Result<HashMap<u32, ColmapCa
 
 /// Reads `images.bin`.
 pub fn images_binary(file: &Path, bytes: &[u8]) -> Result<Vec<ColmapImage>, SceneError> {
-    let mut bytes = Bytes { file, all: bytes, at: 0 };
+    let mut bytes = Bytes::new(file, bytes);
     let count = bytes.u64("number of images")?;
     let mut images = Vec::new();
     for i in 0..count {
         let place = format!("image {i}");
-        bytes.u32(&place)?;
+        let id = bytes.u32(&place)?;
         let (q, t) = (bytes.f64s(&place)?, bytes.f64s(&place)?);
         let camera = bytes.u32(&place)?;
         let name = bytes.text(&place)?;
-        images.push(image(file, &place, q, t, camera, name)?);
+        images.push(image(file, &place, id, q, t, camera, name)?);
         let keypoints = bytes.u64(&place)?;
         // x, y and the number of a point: 24 bytes each.
         bytes.take(keypoints.saturating_mul(24), &format!("{place}, its {keypoints} keypoints"))?;
@@ -247,7 +261,12 @@ pub fn images_binary(file: &Path, bytes: &[u8]) -> Result<Vec<ColmapImage>, Scen
     Ok(images)
 }
 
-fn number<T: std::str::FromStr>(file: &Path, place: &str, field: &str, word: Option<&str>) -> Result<T, SceneError> {
+pub(super) fn number<T: std::str::FromStr>(
+    file: &Path,
+    place: &str,
+    field: &str,
+    word: Option<&str>,
+) -> Result<T, SceneError> {
     let found = word.unwrap_or("nothing");
     word.and_then(|w| w.parse().ok()).ok_or_else(|| In(file).field(place, field, "a number", found))
 }
@@ -295,7 +314,7 @@ pub fn images_text(file: &Path, bytes: &[u8]) -> Result<Vec<ColmapImage>, SceneE
             rest = tail;
             (!word.is_empty()).then_some(word)
         };
-        number::<u32>(file, &place, "IMAGE_ID", word())?;
+        let id = number(file, &place, "IMAGE_ID", word())?;
         let (mut q, mut t) = ([0.0; 4], [0.0; 3]);
         for (v, name) in q.iter_mut().zip(["QW", "QX", "QY", "QZ"]) {
             *v = number(file, &place, name, word())?;
@@ -305,7 +324,7 @@ pub fn images_text(file: &Path, bytes: &[u8]) -> Result<Vec<ColmapImage>, SceneE
         }
         let camera = number(file, &place, "CAMERA_ID", word())?;
         // The rest of the line: names may contain spaces.
-        images.push(image(file, &place, q, t, camera, rest.trim().to_owned())?);
+        images.push(image(file, &place, id, q, t, camera, rest.trim().to_owned())?);
         keypoints = true;
     }
     Ok(images)
@@ -368,6 +387,7 @@ pub(super) fn read(folder: &Path, images_in: Option<&Path>) -> Result<Cameras, S
     };
     drop((camera_bytes, image_bytes));
     images.sort_by(|a, b| a.name.cmp(&b.name));
+    let disagreement = colmap_frames::disagreement(folder, binary, &images)?;
     let absolute = std::fs::canonicalize(folder).map_err(|e| In(folder).read(e))?;
     let scene = scene_of(&absolute);
     let within: Vec<&Path> = absolute.ancestors().take_while(|f| f.starts_with(scene)).collect();
@@ -396,7 +416,7 @@ pub(super) fn read(folder: &Path, images_in: Option<&Path>) -> Result<Cameras, S
         let intrinsics = Intrinsics::Pixels(pixels);
         photos.push(Photo { name: i.name, image, mask: None, intrinsics, lens: camera.lens, further: false });
     }
-    let mut notes = Vec::new();
+    let mut notes: Vec<Note> = disagreement.into_iter().collect();
     found.finish(&mut notes)?;
     if binary && folder.join("cameras.txt").is_file() {
         let text = format!("{}: the binary files are read, not the text files beside them", folder.display());

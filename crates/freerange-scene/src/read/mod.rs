@@ -4,6 +4,7 @@
 //! really there, and what cannot be used is refused with file, place and field.
 
 pub mod colmap;
+mod colmap_frames;
 pub mod metashape;
 mod origin;
 mod photos;
