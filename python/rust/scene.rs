@@ -49,7 +49,7 @@ pub struct Photos {
 pub fn read_scene(py: Python<'_>, path: PathBuf, photos: Photos, up: RawUp) -> PyResult<Scene> {
     let format = photos.cameras.map(|name| {
         let known = Format::ALL.into_iter().find(|f| f.name() == name);
-        let expected = "'transforms', 'colmap', 'polycam', 'metashape' or 'realitycapture'";
+        let expected = "'transforms', 'colmap', 'polycam', 'metashape', 'realitycapture' or 'opf'";
         known.ok_or_else(|| refuse("cameras", expected, format!("'{name}'")))
     });
     let turntable =

@@ -23,7 +23,7 @@ use crate::error::CliError;
 /// How photos are read.
 #[derive(clap::Args)]
 pub struct Photos {
-    /// Whose cameras to read where a folder has several: transforms, colmap, polycam, metashape or realitycapture.
+    /// Whose cameras to read where a folder has several: transforms, colmap, polycam, metashape, realitycapture or opf.
     #[arg(long, value_name = "FORMAT", value_parser = parse_format)]
     cameras: Option<Format>,
     /// The photos have no cameras: they were taken at even steps of one full turn of the object, in order of their names, from this
@@ -31,7 +31,7 @@ pub struct Photos {
     /// add `,cw` for the other way.
     #[arg(long, value_name = "ELEVATION,FOV", conflicts_with = "cameras", allow_hyphen_values = true)]
     turntable: Option<Turntable>,
-    /// The folder of the photos, where they lie apart from the cameras (COLMAP, Polycam, Metashape, RealityCapture).
+    /// The folder of the photos, where they lie apart from the cameras (COLMAP, Polycam, Metashape, RealityCapture, OPF).
     #[arg(long, value_name = "FOLDER")]
     images: Option<PathBuf>,
     /// Where the object's masks come from: a folder of them (NAME.png, white is the object), alpha, plain (one colour behind the object),
@@ -98,7 +98,7 @@ impl UpChoice {
 
 fn parse_format(text: &str) -> Result<Format, String> {
     let known = Format::ALL.into_iter().find(|f| f.name() == text);
-    known.ok_or_else(|| "expected transforms, colmap, polycam, metashape or realitycapture".into())
+    known.ok_or_else(|| "expected transforms, colmap, polycam, metashape, realitycapture or opf".into())
 }
 
 fn parse_masks(text: &str) -> Result<MaskSource, String> {

@@ -29,8 +29,9 @@ pub enum SceneError {
     },
     /// A folder holds nothing that is known.
     #[error(
-        "{}: expected cameras (transforms.json, a COLMAP model, Polycam's keyframes, a Metashape .xml or a RealityCapture .csv), \
-         found {found}; evenly spaced photos without poses: --turntable ELEVATION,FOV",
+        "{}: expected cameras (transforms.json, a COLMAP model, Polycam's keyframes, a Metashape .xml, a RealityCapture .csv or a Pix4D .opf), \
+         found {found}; photos without cameras: `freerange poses PHOTOS -o SCENE` finds them with COLMAP; on a turntable in even steps: \
+         --turntable ELEVATION,FOV",
         folder.display()
     )]
     Nothing {

@@ -3,7 +3,7 @@
 use freerange_camera::{Camera, Lens};
 use freerange_scene::{
     Note, NoteKind, SceneError,
-    read::{Format, Intrinsics, Turntable, cameras, colmap, metashape, polycam, realitycapture},
+    read::{Format, Intrinsics, Turntable, cameras, colmap, metashape, opf, polycam, realitycapture},
 };
 use glam::{DMat3, DVec2, DVec3};
 use serde_json::{Value, json};
@@ -429,4 +429,49 @@ fn realitycapture_is_read() {
     let broken = more.replace("a.jpg,1", "a.jpg,one");
     says(realitycapture::parse(file, broken.as_bytes()), &["line 3", "`x`", "one"]);
     says(realitycapture::parse(file, b"#name,x,y,alt,heading,pitch,roll,f\na.jpg,1\n"), &["line 2", "`y`", "nothing"]);
+}
+
+#[test]
+fn opf_is_read_as_pyopf_writes_it() {
+    let place = freerange_vectors::path("opf");
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    std::fs::create_dir(at("images")).unwrap();
+    for name in ["project.opf", "calibrated_cameras.json", "camera_list.json"] {
+        std::fs::copy(place.join(name), at(name)).unwrap();
+    }
+    for i in 0..3 {
+        image::RgbImage::new(640, 480).save(at(&format!("images/{i}.jpg"))).unwrap();
+    }
+    let truth: Vec<Value> = serde_json::from_slice(&std::fs::read(place.join("expected.json")).unwrap()).unwrap();
+    for path in [folder.path(), &at("project.opf")] {
+        let found = cameras(path, None, None).unwrap();
+        assert_eq!((found.format, found.photos.len()), (Format::Opf, 3));
+        for (photo, truth) in found.photos.iter().zip(&truth) {
+            let camera = photo.camera((640, 480)).unwrap();
+            assert!(camera.center().distance(DVec3::from_slice(&numbers(&truth["center"]))) < 1e-12);
+            let axes = DMat3::from_mat4(camera.world_to_camera).transpose();
+            for (ours, theirs) in [axes.x_axis, axes.y_axis, axes.z_axis].iter().zip(truth["axes"].as_array().unwrap())
+            {
+                assert!(ours.distance(DVec3::from_slice(&numbers(theirs))) < 1e-12);
+            }
+            assert_eq!((camera.fx, camera.cx, camera.cy), (500.0, 321.5, 238.0));
+            assert_eq!(photo.lens, Lens::brown([-0.08, 0.02, 0.001, 0.0], [0.003, -0.004]));
+        }
+    }
+    let text = std::fs::read_to_string(place.join("calibrated_cameras.json")).unwrap();
+    let file = Path::new("c.json");
+    for (from, to, words) in [
+        ("\"perspective\"", "\"spherical\"", ["sensor type spherical", "not supported"]),
+        ("500.0", "-1", ["`focal_length_px`", "above 0"]),
+        ("\"sensor_id\": 7", "\"sensor_id\": 8", ["`sensor_id`", "8"]),
+        ("35.0", "null", ["camera 1", "`orientation_deg`"]),
+        ("\"cameras\"", "\"kameras\"", ["`cameras`", "a list"]),
+    ] {
+        assert!(text.contains(from), "{from}");
+        says(opf::calibrated(file, text.replace(from, to).as_bytes()), &words);
+    }
+    let project = std::fs::read_to_string(at("project.opf")).unwrap();
+    std::fs::write(at("project.opf"), project.replace("calibrated_cameras.json", "../c.json")).unwrap();
+    says(cameras(folder.path(), None, None), &["`uri`", "../c.json"]);
 }

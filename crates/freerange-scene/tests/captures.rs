@@ -730,6 +730,35 @@ fn polycams_files_without_sizes_are_read() {
     }
 }
 
+#[test]
+fn colmap_models_are_written_with_their_origin() {
+    for origin in [DVec3::ZERO, DVec3::new(448_000.0, 5_411_000.0, 300.0)] {
+        let capture = Capture::new();
+        let views: Vec<View> = ring()
+            .into_iter()
+            .map(|(name, camera)| View {
+                name: format!("{} photo", &name[7..8]),
+                camera,
+                image: shot(&camera, |_, _| [0; 4]),
+            })
+            .collect();
+        let points = [(DVec3::new(0.1, 0.2, 0.3), [1, 2, 3]), (DVec3::ZERO, [255, 0, 9])];
+        freerange_scene::write_colmap(capture.0.path(), &views, origin, &points).unwrap();
+        let found = capture.read();
+        assert_eq!((found.format, found.photos.len()), (Format::Colmap, 4));
+        let loaded = load(&found, &LoadConfig::default()).unwrap();
+        for (view, read) in views.iter().zip(&loaded.views) {
+            assert_eq!((view.name.as_str(), view.camera.fx), (read.name.as_str(), read.camera.fx));
+            let off = read.camera.center() + found.origin - origin - view.camera.center();
+            assert!(off.length() < 1e-8, "{off}");
+        }
+        let bytes = std::fs::read(capture.at("sparse/0/points3D.bin")).unwrap();
+        assert_eq!(bytes.len(), 8 + 2 * (8 + 24 + 3 + 8 + 8));
+        assert_eq!(bytes[16..24], (origin.x + 0.1).to_le_bytes());
+        assert_eq!(bytes[40..43], [1, 2, 3]);
+    }
+}
+
 /// A model of wide lenses whose axes are turned away from the ball by so many degrees, and its photos.
 fn wide(model: &str, params: &str, lens: Lens, away: f64, behind: [u8; 4]) -> Capture {
     let capture = Capture::new();

@@ -18,6 +18,7 @@ use freerange_camera::image_ops::{sheet, to_picture};
 use freerange_core::Note;
 use freerange_eval::memory::peak_memory;
 use freerange_formats::{Format, Frame, WriteOptions};
+use freerange_scene::write_colmap;
 use freerange_splat::write_ply_at;
 use serde::Serialize;
 
@@ -71,12 +72,38 @@ pub struct Args {
     /// Samples to draw; they differ where the images leave the object open.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
     samples: u32,
-    /// Also write the Gaussians in these formats: splat, spz, sog, glb, html (a page that shows them).
-    #[arg(long, value_name = "FORMATS", value_delimiter = ',')]
-    format: Vec<Format>,
+    /// Also write the Gaussians in these formats: splat, spz, sog, glb, html (a page that shows them), or colmap (a folder with the photos,
+    /// their cameras, and the Gaussians' middles as points).
+    #[arg(long, value_name = "FORMATS", value_delimiter = ',', value_parser = parse_written)]
+    format: Vec<Written>,
     /// Print the report as JSON on standard output.
     #[arg(long)]
     json: bool,
+}
+
+/// What results are written as.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Written {
+    /// A file of Gaussians.
+    Gaussians(Format),
+    /// COLMAP's sparse model.
+    Colmap,
+}
+
+fn parse_written(text: &str) -> Result<Written, String> {
+    match text {
+        "colmap" => Ok(Written::Colmap),
+        other => other.parse().map(Written::Gaussians).map_err(|expected: String| format!("{expected}, colmap")),
+    }
+}
+
+impl std::fmt::Display for Written {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Gaussians(format) => format.fmt(f),
+            Self::Colmap => f.write_str("colmap"),
+        }
+    }
 }
 
 /// Options of every command that samples.
@@ -372,7 +399,21 @@ fn reconstruct(
         let suffix = if i == 0 { String::new() } else { format!("-{i}") };
         let file = format!("gaussians{suffix}.ply");
         write_ply_at(&sample.gaussians, origin, &output.path(&file)?)?;
-        for format in args.format.iter().filter(|f| **f != Format::Ply) {
+        for format in &args.format {
+            let format = match format {
+                Written::Gaussians(Format::Ply) => continue,
+                Written::Gaussians(format) => format,
+                Written::Colmap => {
+                    let folder = output.path(&format!("colmap{suffix}/sparse"))?;
+                    write_colmap(
+                        folder.parent().unwrap_or(&folder),
+                        &inputs,
+                        origin.unwrap_or_default().into(),
+                        &points(&sample.gaussians),
+                    )?;
+                    continue;
+                }
+            };
             let name = if *format == Format::Html { "view" } else { "gaussians" };
             let options = WriteOptions { frame, ..WriteOptions::default() };
             let path = output.path(&format!("{name}{suffix}.{format}"))?;
@@ -416,6 +457,16 @@ fn reconstruct(
     commit()?;
     output.commit()?;
     Ok((report, json))
+}
+
+/// Opacity below which a Gaussian is no point of the surface.
+const FAINT: f64 = 0.1;
+
+/// Gaussians as points: middles and colors.
+fn points(cloud: &freerange::Cloud) -> Vec<(glam::DVec3, [u8; 3])> {
+    let byte = |v: f64| (255.0 * v.clamp(0.0, 1.0)).round() as u8;
+    let solid = (0..cloud.len()).filter(|i| cloud.opacity(*i) >= FAINT);
+    solid.map(|i| (cloud.mean(i), cloud.color(i).to_array().map(byte))).collect()
 }
 
 /// A transform from positions relative to `origin`, for positions as the scene has them.

@@ -64,9 +64,13 @@ enum Focal {
 impl Description {
     /// Reads and checks a file.
     pub fn read(file: &Path) -> Result<Self, CameraError> {
+        Self::parse(file, &read_limited(file)?)
+    }
+
+    /// Checks a file's bytes; nothing is read, `file` is for messages and to resolve paths.
+    pub fn parse(file: &Path, bytes: &[u8]) -> Result<Self, CameraError> {
         let place = Place { file: file.to_path_buf(), frame: None };
-        let bytes = read_limited(file)?;
-        let root: Value = serde_json::from_slice(bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&bytes))
+        let root: Value = serde_json::from_slice(bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes))
             .map_err(|source| CameraError::Json { file: file.to_path_buf(), source })?;
         let Value::Object(root) = &root else {
             return Err(field(&place, "(whole file)", "an object with `frames`", describe(&root)));

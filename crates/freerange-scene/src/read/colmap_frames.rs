@@ -15,10 +15,12 @@ use std::{collections::HashMap, path::Path};
 const SAME: f64 = 1e-4;
 
 /// A rotation and a translation after it.
-#[derive(Clone, Copy)]
-struct Rigid {
-    rotation: DQuat,
-    translation: DVec3,
+#[derive(Clone, Copy, Debug)]
+pub struct Rigid {
+    /// Of length 1, or not a number where the file's is zero.
+    pub rotation: DQuat,
+    /// In the model's lengths.
+    pub translation: DVec3,
 }
 
 impl Rigid {
@@ -35,9 +37,9 @@ impl Rigid {
 }
 
 /// Poses of sensors in their rigs, by the numbers of rig and camera.
-type Rigs = HashMap<(u32, u32), Rigid>;
+pub type Rigs = HashMap<(u32, u32), Rigid>;
 /// A frame: its rig, its pose, and the camera and image of each of its pictures.
-type Frame = (u32, Rigid, Vec<(u32, u32)>);
+pub type Frame = (u32, Rigid, Vec<(u32, u32)>);
 
 /// A note where the model's frames put its images elsewhere than its images do.
 pub(super) fn disagreement(folder: &Path, binary: bool, images: &[ColmapImage]) -> Result<Option<Note>, SceneError> {
@@ -45,10 +47,7 @@ pub(super) fn disagreement(folder: &Path, binary: bool, images: &[ColmapImage]) 
     let file = |name: &str| Some(folder.join(format!("{name}.{extension}"))).filter(|f| f.is_file());
     let (Some(rigs_file), Some(frames_file)) = (file("rigs"), file("frames")) else { return Ok(None) };
     let (rig_bytes, frame_bytes) = (bytes_of(&rigs_file)?, bytes_of(&frames_file)?);
-    let (rigs, frames) = match binary {
-        true => (rigs_binary(&rigs_file, &rig_bytes)?, frames_binary(&frames_file, &frame_bytes)?),
-        false => (rigs_text(&rigs_file, &rig_bytes)?, frames_text(&frames_file, &frame_bytes)?),
-    };
+    let (rigs, frames) = (rigs(&rigs_file, &rig_bytes, binary)?, frames(&frames_file, &frame_bytes, binary)?);
     let mut by_frames: HashMap<u32, Rigid> = HashMap::new();
     for (rig, pose, data) in frames {
         for (camera, image) in data {
@@ -74,6 +73,16 @@ pub(super) fn disagreement(folder: &Path, binary: bool, images: &[ColmapImage]) 
             first.name
         ))
     }))
+}
+
+/// Reads `rigs.bin` or `rigs.txt`.
+pub fn rigs(file: &Path, bytes: &[u8], binary: bool) -> Result<Rigs, SceneError> {
+    if binary { rigs_binary(file, bytes) } else { rigs_text(file, bytes) }
+}
+
+/// Reads `frames.bin` or `frames.txt`.
+pub fn frames(file: &Path, bytes: &[u8], binary: bool) -> Result<Vec<Frame>, SceneError> {
+    if binary { frames_binary(file, bytes) } else { frames_text(file, bytes) }
 }
 
 /// The number of a camera's kind of sensor in binary files.

@@ -4,8 +4,9 @@
 //! really there, and what cannot be used is refused with file, place and field.
 
 pub mod colmap;
-mod colmap_frames;
+pub mod colmap_frames;
 pub mod metashape;
+pub mod opf;
 mod origin;
 mod photos;
 pub mod polycam;
@@ -27,7 +28,7 @@ use std::{
     io::Read,
     path::{Path, PathBuf},
 };
-pub use turntable::Turntable;
+pub use turntable::{Turntable, in_order, photos_in};
 
 /// Largest image side accepted, in pixels.
 pub(crate) const LARGEST_SIDE: u32 = 16384;
@@ -52,13 +53,16 @@ pub enum Format {
     Metashape,
     /// RealityCapture's (RealityScan's) registration export, CSV.
     Realitycapture,
+    /// Pix4D's Open Photogrammetry Format: `project.opf`.
+    Opf,
     /// None: photos at even steps around the object.
     Turntable,
 }
 
 impl Format {
     /// All that a folder can be found to be.
-    pub const ALL: [Self; 5] = [Self::Transforms, Self::Colmap, Self::Polycam, Self::Metashape, Self::Realitycapture];
+    pub const ALL: [Self; 6] =
+        [Self::Transforms, Self::Colmap, Self::Polycam, Self::Metashape, Self::Realitycapture, Self::Opf];
 
     /// As in options and reports.
     pub fn name(self) -> &'static str {
@@ -68,6 +72,7 @@ impl Format {
             Self::Polycam => "polycam",
             Self::Metashape => "metashape",
             Self::Realitycapture => "realitycapture",
+            Self::Opf => "opf",
             Self::Turntable => "turntable",
         }
     }
@@ -234,9 +239,10 @@ pub fn cameras_with(path: &Path, config: &ReadConfig) -> Result<Cameras, SceneEr
             Some("json") => Format::Transforms,
             Some("xml") => Format::Metashape,
             Some("csv") => Format::Realitycapture,
+            Some("opf") => Format::Opf,
             Some("bin" | "txt") => Format::Colmap,
             _ => {
-                let expected = "a folder, or a file .json, .xml or .csv";
+                let expected = "a folder, or a file .json, .xml, .csv or .opf";
                 return Err(In(path).field("", "file name", expected, path.display()));
             }
         };
@@ -255,7 +261,7 @@ pub fn cameras_with(path: &Path, config: &ReadConfig) -> Result<Cameras, SceneEr
     }
     cameras.root = root_of(path, cameras.format);
     different_files(&mut cameras)?;
-    if matches!(cameras.format, Format::Colmap | Format::Metashape | Format::Realitycapture) {
+    if matches!(cameras.format, Format::Colmap | Format::Metashape | Format::Realitycapture | Format::Opf) {
         cameras.notes.extend(without_camera(&cameras.photos));
     }
     cameras.settle_origin();
@@ -313,7 +319,7 @@ fn read(format: Format, file: &Path, images: Option<&Path>) -> Result<Cameras, S
     match format {
         Format::Transforms if images.is_some() => Err(Invalid::new(
             "--images",
-            "cameras that do not say where their photos are (colmap, polycam, metashape, realitycapture)",
+            "cameras that do not say where their photos are (colmap, polycam, metashape, realitycapture, opf)",
             "transforms.json, which does",
         )
         .into()),
@@ -322,6 +328,7 @@ fn read(format: Format, file: &Path, images: Option<&Path>) -> Result<Cameras, S
         Format::Polycam => polycam::read(file, images),
         Format::Metashape => metashape::read(file, images),
         Format::Realitycapture => realitycapture::read(file, images),
+        Format::Opf => opf::read(file, images),
         Format::Turntable => {
             let expected = "the format of a file; turntables have --turntable ELEVATION,FOV";
             Err(Invalid::new("--cameras", expected, "turntable").into())
@@ -340,6 +347,7 @@ fn look_for(folder: &Path, format: Format) -> Result<Option<PathBuf>, SceneError
         Format::Polycam => polycam::look_for(folder),
         Format::Metashape => single(folder, "xml", metashape::is_one)?,
         Format::Realitycapture => single(folder, "csv", realitycapture::is_one)?,
+        Format::Opf => single(folder, "opf", opf::is_one)?,
         Format::Turntable => None,
     })
 }

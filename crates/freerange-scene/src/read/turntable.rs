@@ -5,7 +5,10 @@ use crate::{SceneError, error::In};
 use freerange_camera::{Camera, Lens, scene::unreadable_kind};
 use freerange_core::Note;
 use glam::DVec3;
-use std::{path::Path, str::FromStr};
+use std::{
+    path::{Path, PathBuf},
+    str::FromStr,
+};
 
 /// How the photos were taken: one full turn in even steps, the camera on one height and aimed at the object's middle.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -43,19 +46,32 @@ impl FromStr for Turntable {
 /// Distance of the cameras from the object: any will do, as nothing tells sizes.
 const DISTANCE: f64 = 1.75;
 
-/// The photos of a folder (or of its `images`), by name, numbers in names by value.
-pub(super) fn read(folder: &Path, turntable: &Turntable) -> Result<Cameras, SceneError> {
+/// The photos of a folder, or of its `images`.
+pub fn photos_in(folder: &Path) -> Result<Vec<PathBuf>, SceneError> {
     let inner = folder.join("images");
     let folder = if inner.is_dir() { inner } else { folder.to_path_buf() };
-    let mut images: Vec<_> =
-        entries(&folder)?.into_iter().filter(|p| p.is_file() && has_extension(p, &IMAGES)).collect();
-    if images.len() < 3 {
-        if let Some((file, kind)) = entries(&folder)?.iter().find_map(|f| Some((f, unreadable_kind(f)?))) {
-            return Err(In(file).unreadable(kind));
-        }
-        return Err(SceneError::TooFew { file: folder, expected: 3, found: images.len() });
+    let there = entries(&folder)?;
+    let images: Vec<_> = there.iter().filter(|p| p.is_file() && has_extension(p, &IMAGES)).cloned().collect();
+    if images.len() >= 3 {
+        return Ok(images);
     }
-    images.sort_by_cached_key(|p| by_value(&p.file_name().unwrap_or_default().to_string_lossy()));
+    match there.iter().find_map(|f| Some((f, unreadable_kind(f)?))) {
+        Some((file, kind)) => Err(In(file).unreadable(kind)),
+        None => Err(SceneError::TooFew { file: folder, expected: 3, found: images.len() }),
+    }
+}
+
+/// Photos in the order of their names, numbers in them by value: that in which cameras take them.
+pub fn in_order(photos: &[PathBuf]) -> Vec<PathBuf> {
+    let mut photos = photos.to_vec();
+    photos.sort_by_cached_key(|p| by_value(&p.file_name().unwrap_or_default().to_string_lossy()));
+    photos
+}
+
+/// The photos of a folder (or of its `images`), by name, numbers in names by value.
+pub(super) fn read(folder: &Path, turntable: &Turntable) -> Result<Cameras, SceneError> {
+    let images = in_order(&photos_in(folder)?);
+    let folder = images[0].parent().unwrap_or(folder).to_path_buf();
     let (count, elevation) = (images.len(), turntable.elevation.to_radians());
     let photos = images
         .into_iter()

@@ -31,7 +31,8 @@ impl Program<'_> {
                 None => self.passed_over.push(format!("{command} {names}")),
             }
         }
-        let log = || OpenOptions::new().create(true).append(true).open(self.log).map_err(|e| CliError::file(self.log, e));
+        let log =
+            || OpenOptions::new().create(true).append(true).open(self.log).map_err(|e| CliError::file(self.log, e));
         let status = run.stdin(Stdio::null()).stdout(log()?).stderr(log()?).status();
         match status.map_err(|e| CliError::file(self.file, e))?.success() {
             true => Ok(()),
@@ -46,8 +47,9 @@ pub fn run(file: &Path, version: &str, job: &Job, log: &Path) -> Result<Done, Cl
     let mut colmap = Program { file, log, passed_over: Vec::new() };
     let path = |p: &Path| p.to_string_lossy().into_owned();
     let flag = |on: bool| u8::from(on).to_string();
-    let (database, images) = (("database_path", path(&job.work.join("database.db"))), ("image_path", path(&job.images)));
-    let bar = Progress::new("poses", 5);
+    let (database, images) =
+        (("database_path", path(&job.work.join("database.db"))), ("image_path", path(&job.images)));
+    let mut bar = Progress::new("poses", 5);
     for (i, names) in job.groups.iter().enumerate() {
         bar.at(1, "features");
         let list = job.work.join(format!("photos-{i}.txt"));
@@ -92,7 +94,8 @@ pub fn run(file: &Path, version: &str, job: &Job, log: &Path) -> Result<Done, Cl
             let model = job.work.join("model");
             std::fs::create_dir_all(&model).map_err(|e| CliError::file(&model, e))?;
             for name in ["cameras.bin", "images.bin", "points3D.bin"] {
-                std::fs::copy(folder.join(name), model.join(name)).map_err(|e| CliError::file(&folder.join(name), e))?;
+                std::fs::copy(folder.join(name), model.join(name))
+                    .map_err(|e| CliError::file(&folder.join(name), e))?;
             }
             // The count is the first number of the file.
             let points = std::fs::read(model.join("points3D.bin")).unwrap_or_default();
@@ -116,7 +119,7 @@ fn mapper(database: &str, images: &str, out: &str, seed: u64) -> Vec<(&'static s
         ("output_path", out.into()),
         ("Mapper.min_model_size", "3".into()),
         ("Mapper.num_threads", "1".into()),
-        ("Mapper.random_seed", seed.to_string()),
+        ("Mapper.random_seed|random_seed", seed.to_string()),
         ("Mapper.abs_pose_min_num_inliers", "15".into()),
         ("Mapper.init_min_tri_angle", "4".into()),
         ("Mapper.init_min_num_inliers", "30".into()),

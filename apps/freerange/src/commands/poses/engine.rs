@@ -129,7 +129,7 @@ fn run_pycolmap(python: &Path, job: &Job, log: &Path) -> Result<Done, CliError> 
     let mut child = command.spawn().map_err(|e| CliError::file(python, e))?;
     let out = child.stdout.take().ok_or_else(|| CliError::failure("a process without output"))?;
     // Features, then matches and a model of neighbors, then of all pairs if it comes to that.
-    let bar = Progress::new("poses", 5);
+    let mut bar = Progress::new("poses", 5);
     let mut step = 0;
     for line in BufReader::new(out).lines().map_while(Result::ok) {
         let Ok(told) = serde_json::from_str::<serde_json::Value>(&line) else { continue };
