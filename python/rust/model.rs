@@ -108,7 +108,9 @@ impl Model {
         options.frame = FrameConfig { up, center, radius, ..FrameConfig::default() };
         let notes = py.detach(|| {
             self.model.check(&options).map_err(of_model)?;
-            cut(&mut views, &Hints { center, radius, others: Some(others_show) }).map_err(of_scene)
+            cut(&mut views, &Hints { center, radius, others: Some(others_show) })
+                .map(|notes| notes.into_iter().map(|note| note.text).collect())
+                .map_err(of_scene)
         })?;
         self.run(py, &views, &options, notes, on_step)
     }

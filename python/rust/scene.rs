@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use freerange::{Cloud, FrameConfig, View, others_show};
 use freerange_formats::{Frame, WriteOptions};
 use freerange_scene::{
-    LoadConfig, Loaded, MaskSource,
+    LoadConfig, Loaded, MaskSource, Note,
     estimate::Hints,
     load,
     read::{Cameras, Format, ReadConfig, Turntable, cameras_with},
@@ -26,7 +26,7 @@ pub struct Scene {
     cameras: Cameras,
     pub loaded: Loaded,
     pub frame: FrameConfig,
-    note: Option<String>,
+    note: Option<Note>,
 }
 
 /// How photos are read; as on the command line.
@@ -49,7 +49,7 @@ pub struct Photos {
 pub fn read_scene(py: Python<'_>, path: PathBuf, photos: Photos, up: RawUp) -> PyResult<Scene> {
     let format = photos.cameras.map(|name| {
         let known = Format::ALL.into_iter().find(|f| f.name() == name);
-        let expected = "'transforms', 'colmap', 'polycam', 'metashape' or 'realitycapture'";
+        let expected = "'transforms', 'colmap', 'polycam', 'metashape', 'realitycapture' or 'opf'";
         known.ok_or_else(|| refuse("cameras", expected, format!("'{name}'")))
     });
     let turntable =
@@ -77,6 +77,7 @@ pub fn read_scene(py: Python<'_>, path: PathBuf, photos: Photos, up: RawUp) -> P
             Some(up) => (up, None),
             None => up_of(&cameras, &loaded),
         };
+        let center = center.map(|c| c - cameras.origin);
         let frame = FrameConfig { up, center, radius: photos.radius, ..FrameConfig::default() };
         Ok(Scene { cameras, loaded, frame, note })
     })
@@ -112,7 +113,7 @@ impl Scene {
 
 impl Scene {
     pub fn notes(&self) -> Vec<String> {
-        self.cameras.notes.iter().chain(&self.loaded.notes).chain(&self.note).cloned().collect()
+        self.cameras.notes.iter().chain(&self.loaded.notes).chain(&self.note).map(|note| note.text.clone()).collect()
     }
 }
 

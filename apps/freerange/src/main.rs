@@ -33,6 +33,8 @@ enum Command {
     Reconstruct(Box<commands::reconstruct::Args>),
     /// Show what is understood of a scene: cameras, masks, place and size, and what may go wrong.
     Inspect(commands::inspect::Args),
+    /// Find the cameras of photos that have none.
+    Poses(commands::poses::Args),
     /// Serve a page: drop photos with cameras, mend masks, and watch the Gaussians appear.
     Serve(Box<commands::serve::Args>),
     /// Render Gaussians from given cameras.
@@ -81,6 +83,7 @@ fn main() -> ExitCode {
     let result = match cli.command {
         Command::Reconstruct(args) => commands::reconstruct::run(&args),
         Command::Inspect(args) => commands::inspect::run(&args),
+        Command::Poses(args) => commands::poses::run(&args),
         Command::Serve(args) => commands::serve::run(&args),
         Command::Render(args) => commands::render::run(&args),
         Command::Convert(args) => commands::convert::run(&args),

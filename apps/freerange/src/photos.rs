@@ -5,11 +5,14 @@ use std::{
     str::FromStr,
 };
 
-use freerange::{FrameConfig, Up, others_show};
+use freerange::{FrameConfig, Reconstructor, Up, choose_views, others_show, to_canonical};
+use freerange_core::Note;
 use freerange_scene::{
     LoadConfig, Loaded, MaskModel, MaskSource, PixelRange,
     estimate::Hints,
-    files, load,
+    files,
+    inspect::view_warnings,
+    load,
     read::{Cameras, Format, ReadConfig, Turntable, cameras, cameras_with},
     up_of,
 };
@@ -20,7 +23,7 @@ use crate::error::CliError;
 /// How photos are read.
 #[derive(clap::Args)]
 pub struct Photos {
-    /// Whose cameras to read where a folder has several: transforms, colmap, polycam, metashape or realitycapture.
+    /// Whose cameras to read where a folder has several: transforms, colmap, polycam, metashape, realitycapture or opf.
     #[arg(long, value_name = "FORMAT", value_parser = parse_format)]
     cameras: Option<Format>,
     /// The photos have no cameras: they were taken at even steps of one full turn of the object, in order of their names, from this
@@ -28,7 +31,7 @@ pub struct Photos {
     /// add `,cw` for the other way.
     #[arg(long, value_name = "ELEVATION,FOV", conflicts_with = "cameras", allow_hyphen_values = true)]
     turntable: Option<Turntable>,
-    /// The folder of the photos, where they lie apart from the cameras (COLMAP, Polycam, Metashape, RealityCapture).
+    /// The folder of the photos, where they lie apart from the cameras (COLMAP, Polycam, Metashape, RealityCapture, OPF).
     #[arg(long, value_name = "FOLDER")]
     images: Option<PathBuf>,
     /// Where the object's masks come from: a folder of them (NAME.png, white is the object), alpha, plain (one colour behind the object),
@@ -95,7 +98,7 @@ impl UpChoice {
 
 fn parse_format(text: &str) -> Result<Format, String> {
     let known = Format::ALL.into_iter().find(|f| f.name() == text);
-    known.ok_or_else(|| "expected transforms, colmap, polycam, metashape or realitycapture".into())
+    known.ok_or_else(|| "expected transforms, colmap, polycam, metashape, realitycapture or opf".into())
 }
 
 fn parse_masks(text: &str) -> Result<MaskSource, String> {
@@ -130,8 +133,17 @@ pub struct Scene {
     pub loaded: Loaded,
     /// Where the object is, as far as it was told, and which way is up.
     pub frame: FrameConfig,
-    /// What was understood, for the user to read.
-    pub notes: Vec<String>,
+    /// What was understood, assumed, changed or left out, for the user to read.
+    pub notes: Vec<Note>,
+}
+
+impl Scene {
+    /// What may go wrong with its photos and masks, as `inspect` tells it.
+    pub fn warnings(&self, model: &Reconstructor) -> Result<Vec<Note>, CliError> {
+        let (frame, _) = to_canonical(&self.loaded.views, &self.frame)?;
+        let shown = choose_views(&self.loaded.views, model.views())?;
+        Ok(view_warnings(&self.loaded, &frame, &shown).into_iter().map(Note::warning).collect())
+    }
 }
 
 impl Photos {
@@ -189,7 +201,7 @@ impl Photos {
     /// Reads a scene.
     pub fn load(&self, cameras: Cameras, up: UpChoice) -> Result<Scene, CliError> {
         let loaded = load(&cameras, &self.config())?;
-        let mut notes: Vec<String> = cameras.notes.iter().chain(&loaded.notes).cloned().collect();
+        let mut notes: Vec<Note> = cameras.notes.iter().chain(&loaded.notes).cloned().collect();
         let up = match up {
             UpChoice::Told(up) => up,
             UpChoice::Auto => {
@@ -198,13 +210,16 @@ impl Photos {
                 up
             }
         };
-        let frame = FrameConfig { up, center: self.center, radius: self.radius, ..FrameConfig::default() };
+        let center = self.center.map(|c| c - cameras.origin);
+        let frame = FrameConfig { up, center, radius: self.radius, ..FrameConfig::default() };
         Ok(Scene { cameras, loaded, frame, notes })
     }
 
-    /// Reads views that are only compared with: all of a scene's.
-    pub fn further(scene: &Path) -> Result<Vec<freerange::View>, CliError> {
-        let loaded = load(&cameras(scene, None, None)?, &LoadConfig::default())?;
+    /// Reads views that are only compared with: all of a scene's, relative to the same origin as those that they are compared with.
+    pub fn further(scene: &Path, origin: DVec3) -> Result<Vec<freerange::View>, CliError> {
+        let mut cameras = cameras(scene, None, None)?;
+        cameras.subtract(origin);
+        let loaded = load(&cameras, &LoadConfig::default())?;
         if loaded.estimate.is_some() {
             let what =
                 "expected views to compare with that have masks (alpha, files, or a plain background), found none";

@@ -53,6 +53,14 @@ impl Camera {
         (self.world_to_camera.transpose() * local).truncate().normalize()
     }
 
+    /// The same camera where positions are relative to `origin`.
+    pub fn relative_to(&self, origin: DVec3) -> Self {
+        let mut camera = *self;
+        let shift = self.world_to_camera.transform_vector3(origin);
+        camera.world_to_camera.w_axis += shift.extend(0.0);
+        camera
+    }
+
     /// The same view at another resolution: intrinsics scale with the image.
     pub fn resized(&self, width: u32, height: u32) -> Self {
         let (sx, sy) = (f64::from(width) / f64::from(self.width), f64::from(height) / f64::from(self.height));

@@ -118,7 +118,7 @@ pub enum CameraError {
     },
     /// The object cannot be told from what is behind it.
     #[error(
-        "{place}: {}: expected an alpha channel or one plain colour behind the object, found {found}; \
+        "{place}: {}: expected an alpha channel or one plain color behind the object, found {found}; \
          cut the object out (PNG or WebP with transparency) or photograph it before a plain background",
         image.display()
     )]

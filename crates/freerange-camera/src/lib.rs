@@ -14,7 +14,8 @@ mod square;
 pub use camera::{Camera, View};
 pub use error::{CameraError, Place};
 pub use frame::{
-    CANONICAL_RADIUS, CanonicalFrame, FrameConfig, Similarity, Up, cameras_up, canonical_from_user, outline_radius,
+    CANONICAL_RADIUS, CanonicalFrame, FrameConfig, Similarity, Up, cameras_up, canonical_from_user, nearest_point,
+    outline_radius,
 };
 pub use freerange_core::image_ops;
 pub use lens::Lens;

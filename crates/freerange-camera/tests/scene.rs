@@ -234,7 +234,7 @@ fn images_that_do_not_serve_are_refused() {
     RgbImage::from_fn(SIDE, SIDE, |x, y| Rgb([(x * 8) as u8, (y * 8) as u8, ((x ^ y) * 8) as u8])).save(&path).unwrap();
     assert_says(&files.refusal(&d), &["frame 2", "alpha channel", "border"]);
     RgbImage::from_pixel(SIDE, SIDE, Rgb([9; 3])).save(&path).unwrap();
-    assert_says(&files.refusal(&d), &["frame 2", "nothing but the colour"]);
+    assert_says(&files.refusal(&d), &["frame 2", "nothing but the color"]);
     RgbaImage::new(SIDE, SIDE).save(&path).unwrap();
     assert_says(&files.refusal(&d), &["frame 2", "transparent everywhere"]);
     // A header that promises a huge image is refused before anything is allocated.
@@ -274,7 +274,7 @@ fn descriptions_that_make_no_sense_are_refused() {
         (|d| d["frames"][1]["file_path"] = json!(""), &["frame 1", "`file_path`"]),
         (|d| d["frames"][1]["file_path"] = json!(".."), &["frame 1", "`file_path`"]),
         (|d| d["frames"][1]["file_path"] = json!("a\0b"), &["frame 1", "no image"]),
-        (|d| d["frames"][3]["file_path"] = json!("images/000.png"), &["frame 3", "`000`", "frame 0"]),
+        (|d| d["frames"][3]["file_path"] = json!("images/000.png"), &["frame 3", "`images_000`", "frame 0"]),
         (|d| d["camera_angle_x"] = json!(0.0), &["`camera_angle_x`", "radians", "found 0.0"]),
         (|d| d["camera_angle_x"] = json!(49.1), &["`camera_angle_x`", "radians", "found 49.1"]),
         (|d| d["camera_angle_x"] = json!(3.13), &["`fl_x`", "focal length"]),
@@ -302,6 +302,7 @@ fn descriptions_that_make_no_sense_are_refused() {
         (|d| d["k1"] = json!(1e200), &["`k1`"]),
         (|d| d["frames"][1]["mask_path"] = json!("m.png"), &["frame 1", "mask_path", "alpha channel"]),
         (|d| d["train_filenames"] = json!(["./images/000"]), &["at least 2 input views", "found 1"]),
+        (|d| d["train_filenames"] = json!(["x.png"]), &["`train_filenames`", "none of them"]),
         (|d| d["train_filenames"] = json!(1), &["`train_filenames`", "found 1"]),
     ];
     for (i, (change, words)) in cases.into_iter().enumerate() {
@@ -310,6 +311,72 @@ fn descriptions_that_make_no_sense_are_refused() {
         println!("case {i}");
         assert_says(&files.refusal(&d), words);
     }
+}
+
+#[test]
+fn descriptions_of_other_systems_are_read() {
+    let files = Files::new();
+    // Windows' separators, capitals, and another extension than was written.
+    let mut d = description();
+    d["frames"][0]["file_path"] = json!("images\\000");
+    d["frames"][1]["file_path"] = json!(".\\images\\001.PNG");
+    d["frames"][2]["file_path"] = json!("images//002.jpg");
+    d["train_filenames"] = json!(["images/000", ".\\images\\001.PNG", "./images/002.jpg"]);
+    let scene = files.load(&d).unwrap();
+    assert_eq!((scene.inputs.len(), scene.further.len()), (3, 1));
+    // A list that has more than the file; a mark of the byte order before it all.
+    d["train_filenames"] = json!(["images/000", "images/001.PNG", "gone.png"]);
+    assert!(files.load(&d).unwrap().notes.iter().any(|n| n.contains("gone.png")));
+    let path = files.0.path().join("transforms.json");
+    std::fs::write(&path, [b"\xef\xbb\xbf".as_slice(), description().to_string().as_bytes()].concat()).unwrap();
+    assert_eq!(Scene::load(&path).unwrap().inputs.len(), 4);
+    // One name in two folders.
+    let mut d = description();
+    std::fs::create_dir(files.0.path().join("left")).unwrap();
+    std::fs::copy(files.0.path().join("images/001.png"), files.0.path().join("left/000.png")).unwrap();
+    d["frames"][1]["file_path"] = json!("left/000.png");
+    let names: Vec<String> = files.load(&d).unwrap().inputs.iter().map(|v| v.name.clone()).collect();
+    assert_eq!(names[..2], ["images_000", "left_000"]);
+    // A frame's own field of view counts for more than the file's focal length.
+    let mut d = description();
+    d.as_object_mut().unwrap().remove("camera_angle_x");
+    d["fl_x"] = json!(40.0);
+    d["frames"][1]["camera_angle_x"] = json!(0.8);
+    let focal: Vec<f64> = files.load(&d).unwrap().inputs.iter().map(|v| v.camera.fx).collect();
+    assert_eq!(focal[0], 40.0);
+    assert!((focal[1] - 16.0 / 0.4f64.tan()).abs() < 1e-9);
+    // An image that cannot be decoded is named with what to do.
+    std::fs::rename(files.0.path().join("images/003.png"), files.0.path().join("images/003.HEIC")).unwrap();
+    assert_says(&files.refusal(&description()), &["frame 3", "HEIC image", "003.HEIC", "convert it to JPEG"]);
+}
+
+#[test]
+fn a_rim_of_nothing_is_no_backdrop() {
+    let (w, h) = (120, 90);
+    // A red disc before white, in a picture whose border is empty or black, all along or at the corners only.
+    let disc = |x: i32, y: i32| (x - 60).pow(2) + (y - 45).pow(2) < 400;
+    for (rim, empty) in [(0, true), (6, true), (0, false), (6, false)] {
+        let hidden = |x: i32, y: i32| {
+            let corner = (x - 60).abs() as f64 / 60.0 + (y - 45).abs() as f64 / 45.0 > 1.8;
+            corner || x < rim || y < rim || x >= w - rim || y >= h - rim
+        };
+        let image = RgbaImage::from_fn(w as u32, h as u32, |x, y| match (x as i32, y as i32) {
+            (x, y) if hidden(x, y) => Rgba([0, 0, 0, if empty { 0 } else { 255 }]),
+            (x, y) if disc(x, y) => Rgba([200, 20, 10, 255]),
+            _ => Rgba([250, 250, 248, 255]),
+        });
+        let (cut, colour) = freerange_camera::scene::cut_out(&image).unwrap();
+        assert_eq!(colour, [250, 250, 248]);
+        let wrong = cut.enumerate_pixels().filter(|(x, y, p)| (p[3] > 128) != disc(*x as i32, *y as i32)).count();
+        assert!(wrong < 20, "{wrong} pixels, rim {rim}, empty {empty}");
+    }
+    // A pale object before black is none of this.
+    let image = RgbaImage::from_fn(w as u32, h as u32, |x, y| match disc(x as i32, y as i32) {
+        true => Rgba([240, 240, 240, 255]),
+        false => Rgba([3, 2, 4, 255]),
+    });
+    let (cut, colour) = freerange_camera::scene::cut_out(&image).unwrap();
+    assert!(colour[0] < 8 && cut.pixels().filter(|p| p[3] > 128).count() > 1000);
 }
 
 #[test]

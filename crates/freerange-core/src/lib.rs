@@ -6,6 +6,7 @@ mod error;
 mod file;
 mod hash;
 pub mod image_ops;
+mod note;
 mod share;
 mod side_by_side;
 
@@ -13,5 +14,6 @@ pub use background::Background;
 pub use error::{Invalid, IoError, check};
 pub use file::{beside, persist, sync_folder, sync_tree, write_atomically};
 pub use hash::{hex, sha256, sha256_of};
+pub use note::{Note, NoteKind};
 pub use share::Share;
 pub use side_by_side::side_by_side;

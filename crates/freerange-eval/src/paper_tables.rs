@@ -293,23 +293,20 @@ fn methods(rows: &[Row], source: &str, views: ViewSet) -> Option<Table> {
         "unseen, mean",
     ];
     let mut table = Table::new(caption, &head);
-    let published: Vec<(&str, u32, f64, Option<f64>, Option<f64>, Option<f64>)> = match views {
-        ViewSet::Partial => PARTIAL.iter().map(|(n, k, _, g)| (*n, *k, g[0], None, None, Some(g[3]))).collect(),
-        ViewSet::Full => FULL.iter().map(|(n, k, _, g)| (*n, *k, g[0], Some(g[1]), Some(g[2]), None)).collect(),
-    };
     let text = |v: Option<f64>, decimals: usize| or_empty(v.map(|v| format!("{v:.decimals$}")));
-    for (name, thousands, psnr, ssim, lpips, fid) in published {
+    let mut publish = |name: &str, thousands: u32, [psnr, ssim, lpips, fid]: [Option<f64>; 4]| {
         let mut row = vec![Cell::text(format!("{name} (published)")), Cell::text(format!("{thousands}K"))];
-        row.extend([
-            text(Some(psnr), 2),
-            text(ssim, 2),
-            text(lpips, 1),
-            Cell::default(),
-            Cell::default(),
-            text(fid, 2),
-        ]);
+        row.extend([text(psnr, 2), text(ssim, 2), text(lpips, 1), Cell::default(), Cell::default(), text(fid, 2)]);
         row.resize(head.len(), Cell::default());
         table.rows.push(row);
+    };
+    match views {
+        ViewSet::Partial => {
+            PARTIAL.iter().for_each(|(n, k, _, g)| publish(n, *k, [Some(g[0]), None, None, Some(g[3])]))
+        }
+        ViewSet::Full => {
+            FULL.iter().for_each(|(n, k, _, g)| publish(n, *k, [Some(g[0]), Some(g[1]), Some(g[2]), None]))
+        }
     }
     for (row, group) in ours {
         let value =

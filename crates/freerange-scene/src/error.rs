@@ -29,8 +29,9 @@ pub enum SceneError {
     },
     /// A folder holds nothing that is known.
     #[error(
-        "{}: expected cameras (transforms.json, a COLMAP model, Polycam's keyframes, a Metashape .xml or a RealityCapture .csv), \
-         found {found}; evenly spaced photos without poses: --turntable ELEVATION,FOV",
+        "{}: expected cameras (transforms.json, a COLMAP model, Polycam's keyframes, a Metashape .xml, a RealityCapture .csv or a Pix4D .opf), \
+         found {found}; photos without cameras: `freerange poses PHOTOS -o SCENE` finds them with COLMAP; on a turntable in even steps: \
+         --turntable ELEVATION,FOV",
         folder.display()
     )]
     Nothing {
@@ -88,7 +89,7 @@ pub enum SceneError {
         advice: &'static str,
     },
     /// An image is not there.
-    #[error("{place}: no image {} (looked in {}; --images FOLDER says where else)", image.display(), folders.join(", "))]
+    #[error("{place}: none of its images is there, {} the first (looked in {}; --images FOLDER says where else)", image.display(), folders.join(", "))]
     MissingImage {
         /// The file and place that name it.
         place: String,
@@ -96,6 +97,20 @@ pub enum SceneError {
         image: PathBuf,
         /// Where it was looked for.
         folders: Vec<String>,
+    },
+    /// One image file is two photos.
+    #[error(
+        "{}: expected one photo for this file, found two with different poses: {first} and {second}; give photos names of their own, or folders \
+         as in the cameras' file",
+        file.display()
+    )]
+    SameFile {
+        /// The image.
+        file: PathBuf,
+        /// Name of one photo.
+        first: String,
+        /// Name of the other.
+        second: String,
     },
     /// An image or mask cannot be decoded.
     #[error("{}: cannot decode", file.display())]
@@ -176,6 +191,11 @@ impl In<'_> {
 
     pub fn unsupported(self, place: &str, feature: impl ToString, advice: &'static str) -> SceneError {
         SceneError::Unsupported { file: self.0.into(), place: place.into(), feature: feature.to_string(), advice }
+    }
+
+    /// An image of a kind that is not decoded.
+    pub fn unreadable(self, kind: &str) -> SceneError {
+        self.unsupported("", format!("a {kind} image"), freerange_camera::scene::CONVERT)
     }
 
     pub fn read(self, source: std::io::Error) -> SceneError {

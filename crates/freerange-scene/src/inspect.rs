@@ -2,6 +2,7 @@
 
 use crate::{Loaded, MaskKind, estimate, read::Cameras};
 use freerange_camera::{CANONICAL_RADIUS, Camera, CanonicalFrame, View, image_ops::resize_area};
+use freerange_core::{Note, NoteKind};
 use glam::{DQuat, DVec3};
 use image::{Rgba, RgbaImage};
 use std::path::PathBuf;
@@ -35,8 +36,8 @@ pub struct Inspection {
     pub views: Vec<ViewReport>,
     /// Number of further views.
     pub further: usize,
-    /// What was understood or changed.
-    pub notes: Vec<String>,
+    /// What was understood, assumed, changed or left out.
+    pub notes: Vec<Note>,
     /// What may go wrong.
     pub warnings: Vec<String>,
 }
@@ -78,18 +79,26 @@ impl ViewReport {
     }
 }
 
-/// Looks at a scene. `frame`: where the object was found; `shown`: which views the model is shown.
-pub fn inspect(cameras: &Cameras, loaded: &Loaded, frame: &CanonicalFrame, shown: &[usize]) -> Inspection {
+/// What may go wrong with the views of a scene. `frame`: where the object was found; `shown`: which views the model is shown.
+pub fn view_warnings(loaded: &Loaded, frame: &CanonicalFrame, shown: &[usize]) -> Vec<String> {
+    warnings(&view_reports(loaded, frame, shown), loaded.estimate.as_ref().map(estimate::Estimate::sureness))
+}
+
+/// The object's middle, its radius and its up.
+fn place(frame: &CanonicalFrame) -> (DVec3, f64, DVec3) {
     let back = frame.canonical_from_user.inverse();
-    let (centre, radius) = (back.apply(DVec3::ZERO), CANONICAL_RADIUS * back.scale);
-    let up = back.rotation * DVec3::Z;
+    (back.apply(DVec3::ZERO), CANONICAL_RADIUS * back.scale, back.rotation * DVec3::Z)
+}
+
+fn view_reports(loaded: &Loaded, frame: &CanonicalFrame, shown: &[usize]) -> Vec<ViewReport> {
+    let (centre, radius, up) = place(frame);
     let agreement = estimate::agreement(&loaded.views, centre, 1.5 * radius);
     let contradicts = match loaded.views.len() {
         0..3 => vec![0.0; loaded.views.len()],
         _ => estimate::contradictions(&loaded.views, centre, 1.5 * radius),
     };
     let to_up = DQuat::from_rotation_arc(up, DVec3::Z);
-    let views: Vec<ViewReport> = loaded
+    loaded
         .views
         .iter()
         .enumerate()
@@ -119,10 +128,18 @@ pub fn inspect(cameras: &Cameras, loaded: &Loaded, frame: &CanonicalFrame, shown
                 },
             }
         })
-        .collect();
+        .collect()
+}
+
+/// Looks at a scene. `frame`: where the object was found; `shown`: which views the model is shown.
+pub fn inspect(cameras: &Cameras, loaded: &Loaded, frame: &CanonicalFrame, shown: &[usize]) -> Inspection {
+    let (centre, radius, up) = place(frame);
+    let views = view_reports(loaded, frame, shown);
     let sureness = loaded.estimate.as_ref().map(estimate::Estimate::sureness);
-    let warnings = warnings(&views, sureness);
-    let notes = cameras.notes.iter().chain(&loaded.notes).chain(&frame.notes).cloned().collect();
+    let found = frame.notes.iter().map(Note::understood);
+    let (told, notes): (Vec<Note>, Vec<Note>) =
+        cameras.notes.iter().chain(&loaded.notes).cloned().chain(found).partition(|n| n.kind == NoteKind::Warning);
+    let warnings = told.into_iter().map(|n| n.text).chain(warnings(&views, sureness)).collect();
     Inspection {
         format: cameras.format,
         files: cameras.files.clone(),

@@ -12,6 +12,9 @@ mod load;
 #[cfg(feature = "mask-model")]
 mod network;
 pub mod read;
+mod write;
 
 pub use error::SceneError;
+pub use freerange_core::{Note, NoteKind};
 pub use load::{LoadConfig, Loaded, MaskKind, MaskModel, MaskSource, PixelRange, cut, files, load, up_of, write_masks};
+pub use write::write_colmap;

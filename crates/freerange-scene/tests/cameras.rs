@@ -2,10 +2,10 @@
 
 use freerange_camera::{Camera, Lens};
 use freerange_scene::{
-    SceneError,
-    read::{Format, Intrinsics, Turntable, cameras, colmap, metashape, polycam, realitycapture},
+    Note, NoteKind, SceneError,
+    read::{Format, Intrinsics, Turntable, cameras, colmap, metashape, opf, polycam, realitycapture},
 };
-use glam::{DMat3, DVec2, DVec3, DVec4};
+use glam::{DMat3, DVec2, DVec3};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
@@ -38,10 +38,10 @@ fn colmap_scene(model: &str, extension: &str) -> tempfile::TempDir {
     folder
 }
 
-fn project(camera: &Camera, lens: &Lens, point: DVec3) -> DVec2 {
-    let p: DVec4 = camera.world_to_camera * point.extend(1.0);
-    let (x, y) = lens.apply(p.x / p.z, p.y / p.z);
-    DVec2::new(x * camera.fx + camera.cx, y * camera.fy + camera.cy)
+/// Where a point in the camera's own axes appears, in pixels.
+fn shown(camera: &Camera, lens: &Lens, point: DVec3) -> Option<DVec2> {
+    let p = lens.project(point)?;
+    Some(DVec2::new(p.x * camera.fx + camera.cx, p.y * camera.fy + camera.cy))
 }
 
 fn message(error: &SceneError) -> String {
@@ -64,7 +64,7 @@ fn says<T>(result: Result<T, SceneError>, words: &[&str]) {
 fn colmap_models_project_as_pycolmap_does() {
     let expected = expected();
     let models = expected["models"].as_object().unwrap();
-    assert_eq!(models.len(), 7);
+    assert_eq!(models.len(), 18);
     for (model, truth) in models {
         for extension in ["bin", "txt"] {
             let folder = colmap_scene(model, extension);
@@ -76,7 +76,8 @@ fn colmap_models_project_as_pycolmap_does() {
                 let pixels = truth["images"][&photo.name].as_array().unwrap();
                 for (point, pixel) in truth["points"].as_array().unwrap().iter().zip(pixels) {
                     let point = DVec3::from_slice(&numbers(point));
-                    let (ours, theirs) = (project(&camera, &photo.lens, point), DVec2::from_slice(&numbers(pixel)));
+                    let ours = shown(&camera, &photo.lens, camera.world_to_camera.transform_point3(point)).unwrap();
+                    let theirs = DVec2::from_slice(&numbers(pixel));
                     assert!(ours.distance(theirs) < 1e-7, "{model}.{extension}: {ours} {theirs}");
                 }
             }
@@ -85,14 +86,67 @@ fn colmap_models_project_as_pycolmap_does() {
 }
 
 #[test]
-fn other_colmap_models_are_refused_by_name() {
-    let refused = expected()["refused"].as_array().unwrap().clone();
-    assert_eq!(refused.len(), 11);
-    for model in refused.iter().map(|m| m.as_str().unwrap()) {
-        for extension in ["bin", "txt"] {
-            let words = [&format!("the camera model {model} is not supported"), "undistort"];
-            says(cameras(colmap_scene(model, extension).path(), None, None), &words);
+fn lenses_show_rays_where_pycolmap_does_and_lead_back() {
+    let expected = expected();
+    assert_eq!(expected["pycolmap"], "4.2.1");
+    for (model, rays) in expected["rays"].as_object().unwrap() {
+        let photo = cameras(colmap_scene(model, "bin").path(), None, None).unwrap().photos.remove(0);
+        let camera = photo.camera((640, 480)).unwrap();
+        let mut compared = 0;
+        for pair in rays.as_array().unwrap() {
+            let ray = DVec3::from_slice(&numbers(&pair[0]));
+            let ours = shown(&camera, &photo.lens, ray);
+            // COLMAP's projections but that of all around show nothing from a right angle on.
+            if pair[1].is_null() {
+                assert!(ray.z < 0.0, "{model}: {ray}");
+                continue;
+            }
+            let (ours, theirs) = (ours.unwrap(), DVec2::from_slice(&numbers(&pair[1])));
+            assert!(ours.distance(theirs) < 1e-7, "{model}: {ray} at {ours}, not {theirs}");
+            let back = photo.lens.ray((theirs.x - camera.cx) / camera.fx, (theirs.y - camera.cy) / camera.fy);
+            let back = back.unwrap_or_else(|| panic!("{model}: no ray at {theirs}, expected {ray}"));
+            assert!(back.distance(ray) < 1e-8, "{model}: {ray} comes back as {back}");
+            compared += 1;
         }
+        assert!(compared >= 20, "{model}: {compared}");
+    }
+}
+
+#[test]
+fn rigs_are_read_and_compared_with_images() {
+    let expected = expected();
+    for extension in ["bin", "txt"] {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        std::fs::create_dir_all(at("images")).unwrap();
+        for name in ["cameras", "images", "rigs", "frames"] {
+            let name = format!("{name}.{extension}");
+            std::fs::copy(golden("rig").join(&name), at(&name)).unwrap();
+        }
+        let centers = expected["rig"].as_object().unwrap();
+        for name in centers.keys() {
+            image::RgbImage::new(640, 480).save(at("images").join(name)).unwrap();
+        }
+        let found = cameras(folder.path(), None, None).unwrap();
+        assert_eq!((found.photos.len(), found.notes.len()), (4, 0), "{:?}", found.notes);
+        for photo in &found.photos {
+            let center = photo.camera((640, 480)).unwrap().center();
+            assert!(center.distance(DVec3::from_slice(&numbers(&centers[&photo.name]))) < 1e-9);
+        }
+        // Frames that a script has moved, and broken ones.
+        let mut frames = std::fs::read(at(&format!("frames.{extension}"))).unwrap();
+        match extension {
+            "bin" => {
+                let z = 8 + 8 + 48;
+                frames[z..z + 8].copy_from_slice(&15f64.to_le_bytes());
+            }
+            _ => frames = String::from_utf8(frames).unwrap().replacen(" 0 5 2 ", " 0 15 2 ", 1).into_bytes(),
+        }
+        std::fs::write(at(&format!("frames.{extension}")), &frames).unwrap();
+        let notes = cameras(folder.path(), None, None).unwrap().notes;
+        assert!(notes.iter().any(|n| n.kind == NoteKind::Warning && n.contains("2 of 4 images")), "{notes:?}");
+        std::fs::write(at(&format!("frames.{extension}")), &frames[..frames.len() - 9]).unwrap();
+        says(cameras(folder.path(), None, None), &[&format!("frames.{extension}")]);
     }
 }
 
@@ -148,6 +202,9 @@ fn broken_colmap_files_are_refused() {
     says(text("1 PINHOLE 640 480 500 500 320"), &["line 1", "4 numbers for PINHOLE", "found 3"]);
     says(text("#\n\n1 PINHOLE 640 wide 500 500 320 240"), &["line 3", "`HEIGHT`", "wide"]);
     says(text("1 PINHALE 640 480 500"), &["`model`", "PINHALE"]);
+    says(text("1 FOV 640 480 500 500 320 240 4"), &["line 1", "`omega`", "0 to pi", "4"]);
+    says(text("1 EUCM 640 480 500 500 320 240 0.5 -1"), &["line 1", "`alpha, beta`"]);
+    says(text("1 EUCM 640 480 500 500 320 240 0.5 nan"), &["line 1", "`distortion`"]);
     says(text("1 PINHOLE 640 480 500 500 320 240\n1 PINHOLE 640 480 500 500 320 240"), &["line 2", "CAMERA_ID"]);
     says(colmap::cameras_text(file, b"\xff\xfe"), &["not UTF-8"]);
     let text = |bad: &str| colmap::images_text(Path::new("i.txt"), bad.as_bytes());
@@ -171,12 +228,18 @@ fn broken_colmap_files_are_refused() {
     }
     std::fs::write(sparse.join("cameras.txt"), &good).unwrap();
     std::fs::remove_file(scene.path().join("images/camera000001_frame000001.png")).unwrap();
-    says(cameras(scene.path(), None, None), &["frame000001.png", "images.txt", "looked in"]);
+    let fewer = cameras(scene.path(), None, None).unwrap();
+    assert_eq!(fewer.photos.len(), 2);
+    let told = |n: &Note| n.kind == NoteKind::Warning && n.contains("1 of 3") && n.contains("frame000001.png");
+    assert!(fewer.notes.iter().any(told), "{:?}", fewer.notes);
     // Names never lead out of the folder.
     let images = std::fs::read_to_string(sparse.join("images.txt")).unwrap();
     std::fs::write(scene.path().join("outside.png"), b"").unwrap();
     std::fs::write(sparse.join("images.txt"), images.replace("camera000001_frame000001.png", "../../x.png")).unwrap();
-    says(cameras(scene.path(), None, None), &["no image"]);
+    assert!(cameras(scene.path(), None, None).unwrap().notes.iter().any(|n| n.contains("../../x.png")));
+    // None at all.
+    std::fs::remove_dir_all(scene.path().join("images")).unwrap();
+    says(cameras(scene.path(), None, None), &["none of its images", "images.txt", "looked in"]);
 }
 
 #[test]
@@ -245,7 +308,7 @@ fn polycam_is_read_as_nerfstudio_reads_it() {
         }
     }
     let file = Path::new("1.json");
-    let camera = polycam::camera(file, root.to_string().as_bytes()).unwrap();
+    let camera = polycam::camera(file, root.to_string().as_bytes(), None).unwrap();
     assert!(camera.center().distance(centre) < 1e-12 && (camera.fx, camera.fy, camera.cy) == (500.0, 501.0, 239.0));
     assert!(camera.ray_direction(320.0, 239.0).distance(axes.z_axis) < 1e-12);
 
@@ -263,15 +326,15 @@ fn polycam_is_read_as_nerfstudio_reads_it() {
     let bad = |name: &str, value: Value| {
         let mut root = root.clone();
         root[name] = value;
-        polycam::camera(file, root.to_string().as_bytes())
+        polycam::camera(file, root.to_string().as_bytes(), None)
     };
     says(bad("t_12", json!("a")), &["1.json", "`t_12`", "a number"]);
     says(bad("t_12", json!(7)), &["rotation"]);
     says(bad("width", json!(640.5)), &["`width`", "640.5"]);
     says(bad("fx", json!(1e-9)), &["focal length"]);
-    says(bad("t_03", json!(1e9)), &["position"]);
-    says(polycam::camera(file, b"[]"), &["an object"]);
-    says(polycam::camera(file, b"{"), &["not JSON"]);
+    says(bad("t_03", json!(1e10)), &["position"]);
+    says(polycam::camera(file, b"[]", None), &["an object"]);
+    says(polycam::camera(file, b"{", None), &["not JSON"]);
 }
 
 #[test]
@@ -293,8 +356,9 @@ fn metashape_is_read() {
         m.join(" ")
     );
     let file = Path::new("x.xml");
-    let (photos, without) = metashape::parse(file, xml.as_bytes()).unwrap();
-    assert_eq!((photos.len(), without, photos[0].label.as_str()), (1, 1, "a.b.png"));
+    let metashape::Export { photos, notes } = metashape::parse(file, xml.as_bytes()).unwrap();
+    assert_eq!((photos.len(), photos[0].label.as_str()), (1, "a.b.png"));
+    assert!(notes.iter().any(|n| n.kind == NoteKind::Dropped && n.contains("1 photos have no pose")), "{notes:?}");
     let c = photos[0].camera;
     assert_eq!((c.fx, c.fy, c.cx, c.cy), (503.0, 500.0, 321.5, 238.0));
     assert!(c.center().distance(centre) < 1e-9 && c.ray_direction(c.cx, c.cy).distance(axes.z_axis) < 1e-9);
@@ -318,6 +382,7 @@ fn metashape_is_read() {
     says(bad("<f>500</f>", "<f>wide</f>"), &["`f`", "wide"]);
     says(bad("sensor_id=\"0\"", "sensor_id=\"7\""), &["camera \"a.b.png\"", "`sensor_id`", "7"]);
     says(bad("</transform>", " 1</transform>"), &["16 numbers", "17"]);
+    says(bad("<b1>3</b1>", "<p3>1</p3>"), &["x.xml", "sensor \"0\"", "`p3`", "not supported"]);
     says(bad("<transform>", "<transform>x"), &["camera", "`transform`"]);
     says(bad("</document>", "</documen>"), &["not XML"]);
     says(bad("<chunk label", "<chunk/><chunk label"), &["one chunk", "2"]);
@@ -327,22 +392,21 @@ fn metashape_is_read() {
 #[test]
 fn realitycapture_is_read() {
     let csv = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n\
-               a.jpg,1,2,3,0,0,0,36,0.5,-0.25,-0.1,0,0,0,0,0\n\
+               a.jpg,1,2,3,0,0,0,36,0.02,-0.01,-0.1,0,0,0,0,0\n\
                b.jpg,1,2,3,90,90,0,36,0,0,0,0,0,0,0,0\n";
     let file = Path::new("x.csv");
     let rows = realitycapture::parse(file, csv.as_bytes()).unwrap();
     let look = |i: usize| {
-        let Intrinsics::Relative { world_to_camera: m, focal, offset } = rows[i].1 else { panic!("no sizes") };
+        let Intrinsics::Relative { world_to_camera: m, focal, offset, upright: false } = rows[i].1 else {
+            panic!("no sizes")
+        };
         let axes = DMat3::from_mat4(m).transpose();
         (axes.z_axis, -axes.y_axis, focal, offset)
     };
     // Straight down, the top to the north.
     let (forward, up, focal, offset) = look(0);
     assert!(forward.distance(-DVec3::Z) < 1e-12 && up.distance(DVec3::Y) < 1e-12);
-    assert_eq!(
-        (focal, offset, rows[0].2),
-        (1.0, [0.5 / 36.0, -0.25 / 36.0], Lens::brown([-0.1, 0.0, 0.0, 0.0], [0.0; 2]))
-    );
+    assert_eq!((focal, offset, rows[0].2), (1.0, [0.02, -0.01], Lens::brown([-0.1, 0.0, 0.0, 0.0], [0.0; 2])));
     // Lifted to the horizon and turned to the east.
     let (forward, up, ..) = look(1);
     assert!(forward.distance(DVec3::X) < 1e-12 && up.distance(DVec3::Z) < 1e-12, "{forward} {up}");
@@ -357,6 +421,57 @@ fn realitycapture_is_read() {
     says(bad("a.jpg,1", "a.jpg,one"), &["line 2", "`x`", "one"]);
     says(bad("a.jpg", ""), &["line 2", "`name`"]);
     says(bad("90,90,0,36", "90,90,0,nan"), &["line 3", "`f`"]);
-    says(bad("0,0,0,0,0,0\n", "0,0,0,0,0.1,0\n"), &["tangential"]);
+    says(bad(",0.02,", ",1.02,"), &["line 2", "`px`", "1.02"]);
+    // Tangential coefficients are OpenCV's; a count may come first.
+    let more = format!("#cameras 2\n{}", csv.replace("0,0,0,0,0,0\n", "0,0,0,0,0.1,0.2\n"));
+    let rows = realitycapture::parse(file, more.as_bytes()).unwrap();
+    assert_eq!(rows[1].2, Lens::brown([0.0; 4], [0.1, 0.2]));
+    let broken = more.replace("a.jpg,1", "a.jpg,one");
+    says(realitycapture::parse(file, broken.as_bytes()), &["line 3", "`x`", "one"]);
     says(realitycapture::parse(file, b"#name,x,y,alt,heading,pitch,roll,f\na.jpg,1\n"), &["line 2", "`y`", "nothing"]);
+}
+
+#[test]
+fn opf_is_read_as_pyopf_writes_it() {
+    let place = freerange_vectors::path("opf");
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    std::fs::create_dir(at("images")).unwrap();
+    for name in ["project.opf", "calibrated_cameras.json", "camera_list.json"] {
+        std::fs::copy(place.join(name), at(name)).unwrap();
+    }
+    for i in 0..3 {
+        image::RgbImage::new(640, 480).save(at(&format!("images/{i}.jpg"))).unwrap();
+    }
+    let truth: Vec<Value> = serde_json::from_slice(&std::fs::read(place.join("expected.json")).unwrap()).unwrap();
+    for path in [folder.path(), &at("project.opf")] {
+        let found = cameras(path, None, None).unwrap();
+        assert_eq!((found.format, found.photos.len()), (Format::Opf, 3));
+        for (photo, truth) in found.photos.iter().zip(&truth) {
+            let camera = photo.camera((640, 480)).unwrap();
+            assert!(camera.center().distance(DVec3::from_slice(&numbers(&truth["center"]))) < 1e-12);
+            let axes = DMat3::from_mat4(camera.world_to_camera).transpose();
+            for (ours, theirs) in [axes.x_axis, axes.y_axis, axes.z_axis].iter().zip(truth["axes"].as_array().unwrap())
+            {
+                assert!(ours.distance(DVec3::from_slice(&numbers(theirs))) < 1e-12);
+            }
+            assert_eq!((camera.fx, camera.cx, camera.cy), (500.0, 321.5, 238.0));
+            assert_eq!(photo.lens, Lens::brown([-0.08, 0.02, 0.001, 0.0], [0.003, -0.004]));
+        }
+    }
+    let text = std::fs::read_to_string(place.join("calibrated_cameras.json")).unwrap();
+    let file = Path::new("c.json");
+    for (from, to, words) in [
+        ("\"perspective\"", "\"spherical\"", ["sensor type spherical", "not supported"]),
+        ("500.0", "-1", ["`focal_length_px`", "above 0"]),
+        ("\"sensor_id\": 7", "\"sensor_id\": 8", ["`sensor_id`", "8"]),
+        ("35.0", "null", ["camera 1", "`orientation_deg`"]),
+        ("\"cameras\"", "\"kameras\"", ["`cameras`", "a list"]),
+    ] {
+        assert!(text.contains(from), "{from}");
+        says(opf::calibrated(file, text.replace(from, to).as_bytes()), &words);
+    }
+    let project = std::fs::read_to_string(at("project.opf")).unwrap();
+    std::fs::write(at("project.opf"), project.replace("calibrated_cameras.json", "../c.json")).unwrap();
+    says(cameras(folder.path(), None, None), &["`uri`", "../c.json"]);
 }

@@ -19,7 +19,7 @@ fn disc(x: u32, y: u32) -> bool {
     (x as i32 - 20).pow(2) + (y as i32 - 14).pow(2) < 64
 }
 
-/// A red disc before a pattern that no plain colour could be cut from.
+/// A red disc before a pattern that no plain color could be cut from.
 fn photo(w: u32, h: u32) -> RgbImage {
     RgbImage::from_fn(w, h, |x, y| match disc(x, y) {
         true => Rgb([200, 30, 20]),
@@ -138,7 +138,7 @@ fn masks_are_found_by_every_naming() {
     says(load(&found, &config), &["b.png", "cannot decode"]);
     says(load(&found, &self::config(MaskSource::Files(files.path("none")))), &["cannot read", "none"]);
     says(load(&found, &self::config(MaskSource::Alpha)), &["a", "alpha channel", "opaque"]);
-    says(load(&found, &self::config(MaskSource::Plain)), &["a", "plain colour"]);
+    says(load(&found, &self::config(MaskSource::Plain)), &["a", "plain color"]);
 
     // And masks that the cameras' file names.
     let mut root: Value = serde_json::from_slice(&std::fs::read(files.path("transforms.json")).unwrap()).unwrap();
@@ -270,5 +270,5 @@ fn scenes_that_cannot_serve_are_refused() {
     let cut = RgbaImage::from_fn(W, H, |x, y| if disc(x, y) { Rgba([200, 30, 20, 255]) } else { Rgba([0; 4]) });
     cut.save(files.path("images/a.png")).unwrap();
     let found = files.describe(["a.png", "b.png", "c.png"], json!({}));
-    says(load(&found, &LoadConfig::default()), &["b", "alpha channel", "plain colour"]);
+    says(load(&found, &LoadConfig::default()), &["b", "alpha channel", "plain color"]);
 }

@@ -171,6 +171,8 @@ pub fn prepare(
     write_atomically(&scene_file(folder), |w| std::io::Write::write_all(w, &text)).map_err(Refusal::own)?;
 
     let mut understood = serde_json::to_value(&report).map_err(Refusal::own)?;
+    // The page shows sentences.
+    understood["notes"] = report.notes.iter().map(|note| note.text.as_str()).collect();
     understood["canonical_from_user"] =
         serde_json::to_value::<Similarity>(canonical.canonical_from_user).map_err(Refusal::own)?;
     for (view, told) in loaded.views.iter().zip(understood["views"].as_array_mut().into_iter().flatten()) {

@@ -24,6 +24,6 @@ pub use error::SplatError;
 pub use harmonics::{Harmonics, MAX_DEGREE, coefficients};
 pub use merge::{Gaussian, OPACITY_RANGE, merge};
 pub use normalize::{Normalization, STD_FLOOR, Statistics};
-pub use ply::{PlyFile, SCALE_OF_NONE, encode_ply, encode_splats, parse_ply, read_ply, write_ply};
+pub use ply::{PlyFile, SCALE_OF_NONE, encode_ply, encode_splats, parse_ply, read_ply, write_ply, write_ply_at};
 pub use splats::{RenderMode, Splats};
 pub use tree::{LodTree, Node};

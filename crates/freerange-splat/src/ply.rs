@@ -200,6 +200,21 @@ pub fn write_ply(cloud: &Cloud, file: &Path) -> Result<(), SplatError> {
     Ok(write_atomically(file, |w| write_to(cloud, w)).map_err(IoError::at(file))?)
 }
 
+/// As [`write_ply`], with a comment that says what positions are relative to where they would be too large for 32 bits.
+///
+/// # Errors
+/// As [`write_ply`].
+pub fn write_ply_at(cloud: &Cloud, origin: Option<[f64; 3]>, file: &Path) -> Result<(), SplatError> {
+    cloud.check_finite()?;
+    let comments: Vec<String> = origin.map(|origin| origin_comment(origin.into())).into_iter().collect();
+    let written = write_atomically(file, |w| write_all(cloud, &Harmonics::default(), &comments, w));
+    Ok(written.map_err(IoError::at(file))?)
+}
+
+fn origin_comment(origin: DVec3) -> String {
+    format!("Origin: {}", origin.to_array().map(|v| v.to_string()).join(" "))
+}
+
 /// The bytes that [`write_ply`] writes.
 ///
 /// # Errors
@@ -226,7 +241,7 @@ pub fn encode_splats(splats: &Splats, up: DVec3) -> Result<Vec<u8>, SplatError> 
     let up = up.to_array().map(|v| ((v * 1e9).round() / 1e9 + 0.0).to_string()).join(" ");
     let mut comments = vec![format!("SplatRenderMode: {mode}"), format!("Vertical axis: {up}")];
     if splats.origin != DVec3::ZERO {
-        comments.push(format!("Origin: {}", splats.origin.to_array().map(|v| v.to_string()).join(" ")));
+        comments.push(origin_comment(splats.origin));
     }
     let mut bytes = Vec::new();
     write_all(&splats.cloud, &splats.harmonics, &comments, &mut bytes).expect("memory can be written to");

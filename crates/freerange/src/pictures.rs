@@ -22,7 +22,15 @@ pub const WHITE: [f32; 3] = [1.0; 3];
 /// # Errors
 /// If the rasteriser refuses the camera or the cloud.
 pub fn render_view(cloud: &Cloud, camera: &Camera) -> Result<Vec<f32>, Error> {
-    Ok(render(cloud.rows(), &[*camera], &[WHITE], &RasterConfig::default())?.rgb)
+    Ok(render(cloud.rows(), &[*camera], &[WHITE], &in_units_of(cloud, camera))?.rgb)
+}
+
+/// Settings with a near plane for the cloud's own units: as usual from a distance of one unit on, in proportion below.
+fn in_units_of(cloud: &Cloud, camera: &Camera) -> RasterConfig {
+    let usual = RasterConfig::default();
+    let Some((low, high)) = cloud.bounds() else { return usual };
+    let distance = camera.center().distance(0.5 * (low + high));
+    RasterConfig { near: usual.near * (distance as f32).clamp(1e-30, 1.0), ..usual }
 }
 
 /// Renders one view of Gaussians from a file on white, with colors as seen from this camera and drawn in `mode`.

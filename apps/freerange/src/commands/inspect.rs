@@ -100,7 +100,7 @@ fn print(args: &Args, found: &Inspection) {
             if view.shown { "" } else { ", not shown" },
         );
     }
-    found.notes.iter().for_each(|note| println!("  note: {note}"));
+    found.notes.iter().for_each(|note| println!("  {note}"));
     found.warnings.iter().for_each(|warning| println!("  warning: {warning}"));
     println!("  {}", args.output.join("inspect.png").display());
 }

@@ -8,6 +8,7 @@ pub mod eval;
 pub mod export;
 pub mod inspect;
 pub mod model;
+pub mod poses;
 pub mod reconstruct;
 pub mod render;
 pub mod serve;

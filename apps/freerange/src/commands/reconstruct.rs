@@ -13,14 +13,17 @@ use freerange::{
     Cloud, Compute, Device, DeviceName, EncoderPlaces, Options, Reconstructor, SETTINGS_SCHEMA, SampleConfig, Scores,
     Solver, Stage, View,
     pictures::{on_white, render_view, write_turntable},
-    score, write_ply,
+    score,
 };
 use freerange_camera::{
     FrameConfig, canonical_from_user,
     image_ops::{sheet, to_picture},
 };
+use freerange_core::Note;
 use freerange_eval::memory::peak_memory;
 use freerange_formats::{Format, Frame, WriteOptions};
+use freerange_scene::write_colmap;
+use freerange_splat::{Splats, write_ply_at};
 use serde::Serialize;
 
 use crate::{
@@ -76,12 +79,38 @@ pub struct Args {
     /// Samples to draw; they differ where the images leave the object open.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
     samples: u32,
-    /// Also write the Gaussians in these formats: splat, spz, sog, glb, html (a page that shows them).
-    #[arg(long, value_name = "FORMATS", value_delimiter = ',')]
-    format: Vec<Format>,
+    /// Also write the Gaussians in these formats: splat, spz, sog, glb, html (a page that shows them), or colmap (a folder with the photos,
+    /// their cameras, and the Gaussians' middles as points).
+    #[arg(long, value_name = "FORMATS", value_delimiter = ',', value_parser = parse_written)]
+    format: Vec<Written>,
     /// Print the report as JSON on standard output.
     #[arg(long)]
     json: bool,
+}
+
+/// What results are written as.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Written {
+    /// A file of Gaussians.
+    Gaussians(Format),
+    /// COLMAP's sparse model.
+    Colmap,
+}
+
+fn parse_written(text: &str) -> Result<Written, String> {
+    match text {
+        "colmap" => Ok(Written::Colmap),
+        other => other.parse().map(Written::Gaussians).map_err(|expected: String| format!("{expected}, colmap")),
+    }
+}
+
+impl std::fmt::Display for Written {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Gaussians(format) => format.fmt(f),
+            Self::Colmap => f.write_str("colmap"),
+        }
+    }
 }
 
 /// Options of every command that samples.
@@ -265,8 +294,12 @@ impl Watch {
 #[derive(Serialize)]
 struct SceneReport {
     scene: PathBuf,
-    notes: Vec<String>,
+    /// What was understood, assumed, changed or left out, and what may make the result wrong.
+    notes: Vec<Note>,
     settings_schema: u32,
+    /// What was subtracted from all positions of the scene: results are relative to it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    origin: Option<[f64; 3]>,
     sampling: SampleConfig,
     /// Names of the views that the model was shown.
     views_shown: Vec<String>,
@@ -274,7 +307,7 @@ struct SceneReport {
     #[serde(skip_serializing_if = "Vec::is_empty")]
     held_out: Vec<String>,
     gaussians: usize,
-    /// Scale, rotation (x y z w) and translation from the scene's frame to the model's.
+    /// Scale, rotation (x y z w) and translation from the scene's own frame, before `origin` is subtracted, to the model's.
     canonical_from_user: freerange::Similarity,
     samples: Vec<SampleReport>,
     seconds: Vec<(&'static str, f64)>,
@@ -319,7 +352,10 @@ fn run_in(args: &Args, job: &Job) -> Result<(), CliError> {
     let model = args.sampling.open(&device)?;
     let (report, json) = reconstruct(args, path, scene, &model, &args.output, begin, || Ok(()))?;
     match args.json {
-        true => println!("{json}"),
+        true => {
+            tell(&report.notes);
+            println!("{json}");
+        }
         false => print(&report, &args.output),
     }
     Ok(())
@@ -352,10 +388,12 @@ fn reconstruct(
     begin: Instant,
     commit: impl FnOnce() -> Result<(), CliError>,
 ) -> Result<(SceneReport, String), CliError> {
+    let warnings = scene.warnings(model)?;
+    let origin = Some(scene.cameras.origin).filter(|o| *o != glam::DVec3::ZERO).map(|o| o.to_array());
     let mut inputs = scene.loaded.views;
     let mut further = scene.loaded.further;
     if let Some(path) = &args.validate {
-        further.extend(Photos::further(path)?);
+        further.extend(Photos::further(path, scene.cameras.origin)?);
     }
     let held = args.holdout.as_ref().map(|h| h.take(&mut inputs)).transpose()?.unwrap_or_default();
     let held_out = held.iter().map(|v| v.name.clone()).collect();
@@ -380,17 +418,33 @@ fn reconstruct(
     let up = result.canonical_from_user.rotation.inverse() * glam::DVec3::Z;
     let frame = Frame::with_up(up).unwrap_or_default();
     let mut notes = scene.notes;
+    notes.extend(warnings);
     let mut samples = Vec::new();
     for (i, sample) in result.samples.iter().enumerate() {
         let suffix = if i == 0 { String::new() } else { format!("-{i}") };
         let file = format!("gaussians{suffix}.ply");
-        write_ply(&sample.gaussians, &output.path(&file)?)?;
-        for format in args.format.iter().filter(|f| **f != Format::Ply) {
+        write_ply_at(&sample.gaussians, origin, &output.path(&file)?)?;
+        for format in &args.format {
+            let format = match format {
+                Written::Gaussians(Format::Ply) => continue,
+                Written::Gaussians(format) => format,
+                Written::Colmap => {
+                    let folder = output.path(&format!("colmap{suffix}/sparse"))?;
+                    write_colmap(
+                        folder.parent().unwrap_or(&folder),
+                        &inputs,
+                        origin.unwrap_or_default().into(),
+                        &points(&sample.gaussians),
+                    )?;
+                    continue;
+                }
+            };
             let name = if *format == Format::Html { "view" } else { "gaussians" };
             let options = WriteOptions { frame, ..WriteOptions::default() };
             let path = output.path(&format!("{name}{suffix}.{format}"))?;
-            let lost = freerange_formats::write(&sample.gaussians.clone().into(), &path, &options)?;
-            notes.extend(lost.into_iter().map(|note| format!("{name}{suffix}.{format}: {note}")));
+            let splats = Splats { origin: origin.unwrap_or_default().into(), ..sample.gaussians.clone().into() };
+            let lost = freerange_formats::write(&splats, &path, &options)?;
+            notes.extend(lost.into_iter().map(|note| Note::dropped(format!("{name}{suffix}.{format}: {note}"))));
         }
         write_turntable(&output.path(&format!("turntable{suffix}.gif"))?, &sample.canonical, 48, 256)?;
         for (view, picture) in comparisons(&sample.gaussians, &inputs)? {
@@ -410,16 +464,17 @@ fn reconstruct(
     }
     seconds.push(("write", begin.elapsed().as_secs_f64()));
 
-    notes.extend(result.notes);
+    notes.extend(result.notes.into_iter().map(Note::understood));
     let report = SceneReport {
         scene: path.into(),
         notes,
         settings_schema: SETTINGS_SCHEMA,
+        origin,
         sampling: options.sample,
         views_shown: result.shown.iter().map(|&i| inputs[i].name.clone()).collect(),
         held_out,
         gaussians: result.samples.first().map_or(0, |s| s.gaussians.len()),
-        canonical_from_user: result.canonical_from_user,
+        canonical_from_user: in_scene(&result.canonical_from_user, origin),
         samples,
         seconds,
         peak_memory_bytes: peak_memory(),
@@ -429,6 +484,25 @@ fn reconstruct(
     commit()?;
     output.commit()?;
     Ok((report, json))
+}
+
+/// Opacity below which a Gaussian is no point of the surface.
+const FAINT: f64 = 0.1;
+
+/// Gaussians as points: middles and colors.
+fn points(cloud: &freerange::Cloud) -> Vec<(glam::DVec3, [u8; 3])> {
+    let byte = |v: f64| (255.0 * v.clamp(0.0, 1.0)).round() as u8;
+    let solid = (0..cloud.len()).filter(|i| cloud.opacity(*i) >= FAINT);
+    solid.map(|i| (cloud.mean(i), cloud.color(i).to_array().map(byte))).collect()
+}
+
+/// A transform from positions relative to `origin`, for positions as the scene has them.
+fn in_scene(from_local: &freerange::Similarity, origin: Option<[f64; 3]>) -> freerange::Similarity {
+    let shift = freerange::Similarity {
+        translation: -glam::DVec3::from_array(origin.unwrap_or_default()),
+        ..freerange::Similarity::IDENTITY
+    };
+    from_local.after(&shift)
 }
 
 /// Each input image beside its render.
@@ -445,10 +519,13 @@ fn comparisons(cloud: &freerange::Cloud, views: &[View]) -> Result<Vec<(String, 
         .collect()
 }
 
+/// Notes and warnings, on standard error.
+fn tell(notes: &[Note]) {
+    notes.iter().for_each(|note| eprintln!("{note}"));
+}
+
 fn print(report: &SceneReport, output: &Path) {
-    for note in &report.notes {
-        println!("note: {note}");
-    }
+    tell(&report.notes);
     for sample in &report.samples {
         println!("{} ({} Gaussians, seed {})", output.join(&sample.file).display(), report.gaussians, sample.seed);
         let line = |what: &str, scores: &Option<Scores>| {

@@ -190,7 +190,10 @@ fn is_canonical(views: &[View], silhouettes: &[Silhouette]) -> bool {
 }
 
 /// The point with the least sum of squared distances to lines `(origin, unit direction)`.
-fn nearest_point(lines: &[(DVec3, DVec3)]) -> Result<DVec3, CameraError> {
+///
+/// # Errors
+/// If they are parallel, or the point lies behind one's origin.
+pub fn nearest_point(lines: &[(DVec3, DVec3)]) -> Result<DVec3, CameraError> {
     let across = |d: DVec3| DMat3::IDENTITY - DMat3::from_cols(d * d.x, d * d.y, d * d.z);
     let mut normal = DMat3::ZERO;
     let mut right = DVec3::ZERO;

@@ -28,15 +28,17 @@ pub struct Description {
     pub frames: Vec<FrameDescription>,
     /// What was understood, for the user to read.
     pub notes: Vec<String>,
-    /// `train_filenames`, where the file has it.
+    /// The poses are in COLMAP's arbitrary frame, whose axes were only exchanged (nerfstudio's `applied_transform`): +z need not be up.
+    pub any_up: bool,
+    /// `train_filenames`, where the file has it, as [`plain_path`] spells them.
     train: Option<HashSet<String>>,
 }
 
 /// One frame, its pose checked; the image itself has not been looked at.
 pub struct FrameDescription {
-    /// Which file and frame this is,, for messages.
+    /// Which file and frame this is, for messages.
     pub place: Place,
-    /// The image's file name without its extension.
+    /// The image's file name without its extension; with its folders where other frames have the same.
     pub name: String,
     /// `file_path` as resolved against the JSON's folder; the extension may be missing.
     pub image: PathBuf,
@@ -62,8 +64,13 @@ enum Focal {
 impl Description {
     /// Reads and checks a file.
     pub fn read(file: &Path) -> Result<Self, CameraError> {
+        Self::parse(file, &read_limited(file)?)
+    }
+
+    /// Checks a file's bytes; nothing is read, `file` is for messages and to resolve paths.
+    pub fn parse(file: &Path, bytes: &[u8]) -> Result<Self, CameraError> {
         let place = Place { file: file.to_path_buf(), frame: None };
-        let root: Value = serde_json::from_slice(&read_limited(file)?)
+        let root: Value = serde_json::from_slice(bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes))
             .map_err(|source| CameraError::Json { file: file.to_path_buf(), source })?;
         let Value::Object(root) = &root else {
             return Err(field(&place, "(whole file)", "an object with `frames`", describe(&root)));
@@ -73,31 +80,41 @@ impl Description {
             other => return Err(field(&place, "frames", "a list of one or more frames", found(other))),
         };
         let folder = file.parent().unwrap_or(Path::new(""));
-        let frames: Vec<FrameDescription> = frames
+        let mut frames: Vec<FrameDescription> = frames
             .iter()
             .enumerate()
             .map(|(i, frame)| FrameDescription::read(frame, root, folder, Place { frame: Some(i), ..place.clone() }))
             .collect::<Result<_, _>>()?;
-        let mut names: HashMap<&str, usize> = HashMap::new();
-        for (i, frame) in frames.iter().enumerate() {
-            if let Some(other) = names.insert(&frame.name, i) {
-                let (place, name) = (frame.place.clone(), frame.name.clone());
-                return Err(CameraError::DuplicateName { place, name, other });
-            }
-        }
-        let train = match root.get("train_filenames") {
+        different_names(&mut frames)?;
+        let train: Option<HashSet<String>> = match root.get("train_filenames") {
             None | Some(Value::Null) => None,
-            Some(Value::Array(names)) => Some(names.iter().filter_map(|n| n.as_str().map(str::to_owned)).collect()),
+            Some(Value::Array(names)) => Some(names.iter().filter_map(|n| n.as_str().map(plain_path)).collect()),
             other => return Err(field(&place, "train_filenames", "a list of file names", found(other))),
         };
+        let mut any_up = false;
         let mut notes = Vec::new();
+        let ours: HashSet<&str> = frames.iter().map(|f| f.written.as_str()).collect();
+        if let Some(train) = &train {
+            let strange = train.iter().filter(|t| !ours.contains(t.as_str())).min();
+            match strange {
+                Some(name) if train.iter().all(|t| !ours.contains(t.as_str())) => {
+                    let expected = "names of which at least one is a frame's `file_path`";
+                    return Err(field(&place, "train_filenames", expected, format!("{name:?}, ..., none of them")));
+                }
+                Some(name) => {
+                    notes.push(format!("{}: `train_filenames` has {name:?}, which no frame has", file.display()))
+                }
+                None => {}
+            }
+        }
         if root.get("applied_transform").is_some_and(|v| !v.is_null()) {
+            any_up = root.get("orientation_override").and_then(Value::as_str) != Some("none");
             let name = file.display();
             notes.push(format!(
                 "{name}: the poses already contain `applied_transform`; results are in the poses' frame"
             ));
         }
-        Ok(Self { file: file.to_path_buf(), frames, notes, train })
+        Ok(Self { file: file.to_path_buf(), frames, notes, any_up, train })
     }
 
     /// Refuses masks in files of their own, which only the crate `freerange-scene` reads.
@@ -126,7 +143,7 @@ impl FrameDescription {
         let fields = Fields { frame, root, place: &place };
         fields.refuse_unsupported()?;
         let written = match frame.get("file_path") {
-            Some(Value::String(path)) if !path.is_empty() => path.clone(),
+            Some(Value::String(path)) if !plain_path(path).is_empty() => plain_path(path),
             other => return Err(field(&place, "file_path", "a file name", found(other))),
         };
         let world_to_camera = pose::world_to_camera(&fields.transform_matrix()?, &place)?;
@@ -143,7 +160,7 @@ impl FrameDescription {
         let lens = fields.lens()?;
         let mask = match fields.get("mask_path") {
             None => None,
-            Some(Value::String(path)) if !path.is_empty() => Some(folder.join(path)),
+            Some(Value::String(path)) if !path.is_empty() => Some(folder.join(plain_path(path))),
             other => return Err(field(&place, "mask_path", "a file name", found(other))),
         };
         let image = folder.join(&written);
@@ -226,7 +243,10 @@ impl Fields<'_> {
         };
         let (fx, fy) = (positive("fl_x")?, positive("fl_y")?);
         let (ax, ay) = (angle("camera_angle_x")?, angle("camera_angle_y")?);
+        // A frame's own angle counts for more than the whole file's pixels.
+        let own = |name: &str| self.frame.get(name).is_some_and(|v| !v.is_null());
         match (fx, ax) {
+            (Some(_), Some(ax)) if own("camera_angle_x") && !own("fl_x") => Ok(Focal::Angles(ax, ay)),
             (Some(fx), _) => Ok(Focal::Pixels(fx, fy)),
             (None, Some(ax)) => Ok(Focal::Angles(ax, ay)),
             (None, None) => Err(field(self.place, "fl_x", "`fl_x` or `camera_angle_x`", "neither".into())),
@@ -309,6 +329,38 @@ impl Fields<'_> {
         }
         Ok(())
     }
+}
+
+/// A path as it is compared and resolved: separated by `/`, without `./` at its beginning and doubled separators.
+fn plain_path(written: &str) -> String {
+    let written = written.replace('\\', "/");
+    let parts: Vec<&str> = written
+        .split('/')
+        .enumerate()
+        .filter(|(i, p)| (*i == 0 || !p.is_empty()) && *p != ".")
+        .map(|(_, p)| p)
+        .collect();
+    parts.join("/")
+}
+
+/// Names that several frames have get their folders, as in `cam0_0001`; two frames of one name are an error then.
+fn different_names(frames: &mut [FrameDescription]) -> Result<(), CameraError> {
+    let mut counts: HashMap<String, usize> = HashMap::new();
+    frames.iter().for_each(|f| *counts.entry(f.name.clone()).or_default() += 1);
+    for frame in frames.iter_mut().filter(|f| counts[&f.name] > 1) {
+        let folders = frame.written.rsplit_once('/').map_or("", |(folders, _)| folders).replace('/', "_");
+        if !folders.is_empty() {
+            frame.name = format!("{folders}_{}", frame.name);
+        }
+    }
+    let mut names: HashMap<&str, usize> = HashMap::new();
+    for (i, frame) in frames.iter().enumerate() {
+        if let Some(other) = names.insert(&frame.name, i) {
+            let (place, name) = (frame.place.clone(), frame.name.clone());
+            return Err(CameraError::DuplicateName { place, name, other });
+        }
+    }
+    Ok(())
 }
 
 fn finite(v: &Value) -> Option<f64> {

@@ -10,10 +10,10 @@ mod json;
 mod pose;
 mod write;
 
-pub use cutout::{BACKGROUND_TOLERANCE, cut_out};
-pub use files::{find, image_size};
+pub use cutout::{BACKGROUND_TOLERANCE, cut_out, fills_frame};
+pub use files::{CONVERT, IMAGE_EXTENSIONS, ImageFiles, Located, image_size, unreadable_kind};
 pub use json::{Description, FrameDescription};
-pub use pose::nearest_rotation;
+pub use pose::{LARGEST_COORDINATE, nearest_rotation};
 pub use write::transforms_json;
 
 use freerange_core::IoError;
@@ -75,7 +75,7 @@ impl Scene {
 /// `w` and `h`, and then only their headers are read. Lens distortion is left out: the cameras are those of the
 /// undistorted images.
 pub fn load_cameras(path: &Path) -> Result<Vec<(String, Camera)>, CameraError> {
-    let description = Description::read(&Found::at(path)?.inputs)?.without_masks()?;
+    let description = Description::read(&Found::at(path)?.inputs)?;
     description
         .frames
         .iter()

@@ -5,8 +5,8 @@ use glam::{DMat3, DMat4, DVec3};
 
 /// Largest accepted departure of `R^T R` from the identity: files often hold only four digits.
 const ORTHONORMAL_TOLERANCE: f64 = 1e-3;
-/// Largest accepted coordinate of a camera; beyond it float32 renderers see nothing but rounding.
-const LARGEST_COORDINATE: f64 = 1e6;
+/// Largest accepted coordinate of a camera: beyond it 64 bits do not resolve a ten-millionth of a unit. (Maps end at 2e7 meters.)
+pub const LARGEST_COORDINATE: f64 = 1e9;
 
 /// The world-to-camera transform with OpenCV axes (x right, y down, z forward) of a camera-to-world matrix with
 /// OpenGL axes (x right, y up, z backward), given row by row: 3 or 4 rows of 4.

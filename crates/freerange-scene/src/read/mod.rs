@@ -4,22 +4,31 @@
 //! really there, and what cannot be used is refused with file, place and field.
 
 pub mod colmap;
+pub mod colmap_frames;
 pub mod metashape;
+pub mod opf;
+mod origin;
+mod photos;
 pub mod polycam;
 pub mod realitycapture;
 mod transforms;
 pub mod turntable;
 
 use crate::{SceneError, error::In};
-use freerange_camera::{Camera, Lens, scene::nearest_rotation};
-use freerange_core::Invalid;
+use freerange_camera::{
+    Camera, Lens,
+    scene::{IMAGE_EXTENSIONS, LARGEST_COORDINATE, nearest_rotation, unreadable_kind},
+};
+use freerange_core::{Invalid, Note};
 use glam::{DMat3, DMat4, DVec3};
+use photos::Photos;
+pub(crate) use photos::listed;
 use std::{
-    collections::BTreeSet,
+    collections::{BTreeSet, HashMap},
     io::Read,
     path::{Path, PathBuf},
 };
-pub use turntable::Turntable;
+pub use turntable::{Turntable, in_order, photos_in};
 
 /// Largest image side accepted, in pixels.
 pub(crate) const LARGEST_SIDE: u32 = 16384;
@@ -27,10 +36,8 @@ pub(crate) const LARGEST_SIDE: u32 = 16384;
 const LARGEST_FILE: u64 = 1 << 30;
 /// Photos of one scene, at most.
 pub(crate) const LARGEST_SCENE: usize = 10_000;
-/// Largest accepted coordinate of a camera; beyond it float32 renderers see nothing but rounding.
-const LARGEST_COORDINATE: f64 = 1e6;
 /// Image files that are taken without being named.
-pub(crate) const IMAGES: [&str; 4] = ["png", "jpg", "jpeg", "webp"];
+pub(crate) const IMAGES: [&str; 4] = IMAGE_EXTENSIONS;
 
 /// Whose cameras they are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
@@ -46,13 +53,16 @@ pub enum Format {
     Metashape,
     /// RealityCapture's (RealityScan's) registration export, CSV.
     Realitycapture,
+    /// Pix4D's Open Photogrammetry Format: `project.opf`.
+    Opf,
     /// None: photos at even steps around the object.
     Turntable,
 }
 
 impl Format {
     /// All that a folder can be found to be.
-    pub const ALL: [Self; 5] = [Self::Transforms, Self::Colmap, Self::Polycam, Self::Metashape, Self::Realitycapture];
+    pub const ALL: [Self; 6] =
+        [Self::Transforms, Self::Colmap, Self::Polycam, Self::Metashape, Self::Realitycapture, Self::Opf];
 
     /// As in options and reports.
     pub fn name(self) -> &'static str {
@@ -62,6 +72,7 @@ impl Format {
             Self::Polycam => "polycam",
             Self::Metashape => "metashape",
             Self::Realitycapture => "realitycapture",
+            Self::Opf => "opf",
             Self::Turntable => "turntable",
         }
     }
@@ -81,6 +92,8 @@ pub enum Intrinsics {
         offset: [f64; 2],
         /// Rigid transform from world to camera.
         world_to_camera: DMat4,
+        /// Whether the camera is that of the photo as viewers show it, turned by its EXIF data, instead of its stored pixels.
+        upright: bool,
     },
 }
 
@@ -101,7 +114,29 @@ pub struct Photo {
     pub further: bool,
 }
 
+impl Intrinsics {
+    /// From world to camera.
+    pub fn world_to_camera(&self) -> DMat4 {
+        match self {
+            Self::Pixels(camera) => camera.world_to_camera,
+            Self::Relative { world_to_camera, .. } => *world_to_camera,
+        }
+    }
+
+    fn world_to_camera_mut(&mut self) -> &mut DMat4 {
+        match self {
+            Self::Pixels(camera) => &mut camera.world_to_camera,
+            Self::Relative { world_to_camera, .. } => world_to_camera,
+        }
+    }
+}
+
 impl Photo {
+    /// Whether its camera is that of the photo as viewers show it.
+    pub(crate) fn is_upright(&self) -> bool {
+        matches!(self.intrinsics, Intrinsics::Relative { upright: true, .. })
+    }
+
     /// The camera for an image of `size` (width, height), which must have the shape that the camera was made for.
     pub fn camera(&self, size: (u32, u32)) -> Result<Camera, SceneError> {
         let (width, height) = size;
@@ -116,7 +151,7 @@ impl Photo {
                 }
                 Ok(camera.resized(width, height))
             }
-            Intrinsics::Relative { focal, offset, world_to_camera } => {
+            Intrinsics::Relative { focal, offset, world_to_camera, .. } => {
                 let side = f64::from(width.max(height));
                 let (cx, cy) = (0.5 * f64::from(width) + side * offset[0], 0.5 * f64::from(height) + side * offset[1]);
                 Ok(Camera { width, height, fx: side * focal, fy: side * focal, cx, cy, world_to_camera })
@@ -134,8 +169,22 @@ pub struct Cameras {
     pub photos: Vec<Photo>,
     /// The files that were read.
     pub files: Vec<PathBuf>,
+    /// The scene's own folder: nothing outside of it is taken without being named.
+    pub root: PathBuf,
+    /// What was subtracted from all positions, in the scene's frame: cameras on maps lie where 32 bits do not resolve an object.
+    pub origin: DVec3,
+    /// Nothing says which way is up: the frame is the one that a reconstruction happened to have.
+    pub any_up: bool,
     /// What was understood or passed over, for the user to read.
-    pub notes: Vec<String>,
+    pub notes: Vec<Note>,
+}
+
+impl Cameras {
+    /// What a reader found; the rest is added by [`cameras_with`].
+    fn new(format: Format, photos: Vec<Photo>, files: Vec<PathBuf>, notes: Vec<Note>) -> Self {
+        let any_up = matches!(format, Format::Colmap | Format::Metashape);
+        Self { format, photos, files, root: PathBuf::new(), origin: DVec3::ZERO, any_up, notes }
+    }
 }
 
 /// How cameras are read.
@@ -163,7 +212,7 @@ pub fn cameras_with(path: &Path, config: &ReadConfig) -> Result<Cameras, SceneEr
     }
     if let Some(turntable) = &config.turntable {
         let folder = images.unwrap_or(path);
-        return turntable::read(folder, turntable);
+        return Ok(Cameras { root: folder.into(), ..turntable::read(folder, turntable)? });
     }
     let mut cameras = if metadata.is_dir() {
         let mut found: Vec<(Format, PathBuf)> = Vec::new();
@@ -190,9 +239,10 @@ pub fn cameras_with(path: &Path, config: &ReadConfig) -> Result<Cameras, SceneEr
             Some("json") => Format::Transforms,
             Some("xml") => Format::Metashape,
             Some("csv") => Format::Realitycapture,
+            Some("opf") => Format::Opf,
             Some("bin" | "txt") => Format::Colmap,
             _ => {
-                let expected = "a folder, or a file .json, .xml or .csv";
+                let expected = "a folder, or a file .json, .xml, .csv or .opf";
                 return Err(In(path).field("", "file name", expected, path.display()));
             }
         };
@@ -209,14 +259,49 @@ pub fn cameras_with(path: &Path, config: &ReadConfig) -> Result<Cameras, SceneEr
         let found = cameras.photos.len();
         return Err(In(path).field("", "photos", &format!("at most {LARGEST_SCENE}"), found));
     }
-    if matches!(cameras.format, Format::Colmap | Format::Metashape | Format::Realitycapture) {
+    cameras.root = root_of(path, cameras.format);
+    different_files(&mut cameras)?;
+    if matches!(cameras.format, Format::Colmap | Format::Metashape | Format::Realitycapture | Format::Opf) {
         cameras.notes.extend(without_camera(&cameras.photos));
     }
+    cameras.settle_origin();
     Ok(cameras)
 }
 
+/// The folder of the scene that `path` names: a folder, or a file in it, or a COLMAP model in its `sparse`.
+fn root_of(path: &Path, format: Format) -> PathBuf {
+    let absolute = std::fs::canonicalize(path).unwrap_or_else(|_| path.into());
+    let folder = if absolute.is_dir() { absolute.as_path() } else { absolute.parent().unwrap_or(Path::new("")) };
+    if format == Format::Colmap { colmap::scene_of(folder).into() } else { folder.into() }
+}
+
+/// A file is one photo: under two poses it is an error that names both; under one pose twice it is used once.
+fn different_files(cameras: &mut Cameras) -> Result<(), SceneError> {
+    let mut seen: HashMap<PathBuf, (String, bool, DMat4)> = HashMap::new();
+    let (mut twice, mut kept) = (0, Vec::with_capacity(cameras.photos.len()));
+    for photo in std::mem::take(&mut cameras.photos) {
+        let pose = photo.intrinsics.world_to_camera();
+        match seen.get(&photo.image) {
+            Some((other, _, others_pose)) if !others_pose.abs_diff_eq(pose, 1e-9) => {
+                return Err(SceneError::SameFile { file: photo.image, first: other.clone(), second: photo.name });
+            }
+            // One that is reconstructed from may be compared with as well.
+            Some((_, further, _)) if *further == photo.further => twice += 1,
+            _ => {
+                seen.insert(photo.image.clone(), (photo.name.clone(), photo.further, pose));
+                kept.push(photo);
+            }
+        }
+    }
+    cameras.photos = kept;
+    if twice > 0 {
+        cameras.notes.push(Note::dropped(format!("{twice} photos are listed twice with one pose, and used once")));
+    }
+    Ok(())
+}
+
 /// A note on the images that lie beside the photos and have no camera: programs do not manage to place them all.
-fn without_camera(photos: &[Photo]) -> Option<String> {
+fn without_camera(photos: &[Photo]) -> Option<Note> {
     let folders: BTreeSet<&Path> = photos.iter().filter_map(|p| p.image.parent()).collect();
     let known: BTreeSet<&Path> = photos.iter().map(|p| p.image.as_path()).collect();
     let there = folders.into_iter().filter_map(|f| entries(f).ok()).flatten();
@@ -226,14 +311,15 @@ fn without_camera(photos: &[Photo]) -> Option<String> {
         .collect();
     let more = if left.len() > 6 { ", ..." } else { "" };
     let names = left.iter().take(6).cloned().collect::<Vec<_>>().join(", ");
-    (!left.is_empty()).then(|| format!("{} photos have no camera and are left out: {names}{more}", left.len()))
+    (!left.is_empty())
+        .then(|| Note::dropped(format!("{} photos have no camera and are left out: {names}{more}", left.len())))
 }
 
 fn read(format: Format, file: &Path, images: Option<&Path>) -> Result<Cameras, SceneError> {
     match format {
         Format::Transforms if images.is_some() => Err(Invalid::new(
             "--images",
-            "cameras that do not say where their photos are (colmap, polycam, metashape, realitycapture)",
+            "cameras that do not say where their photos are (colmap, polycam, metashape, realitycapture, opf)",
             "transforms.json, which does",
         )
         .into()),
@@ -242,6 +328,7 @@ fn read(format: Format, file: &Path, images: Option<&Path>) -> Result<Cameras, S
         Format::Polycam => polycam::read(file, images),
         Format::Metashape => metashape::read(file, images),
         Format::Realitycapture => realitycapture::read(file, images),
+        Format::Opf => opf::read(file, images),
         Format::Turntable => {
             let expected = "the format of a file; turntables have --turntable ELEVATION,FOV";
             Err(Invalid::new("--cameras", expected, "turntable").into())
@@ -260,6 +347,7 @@ fn look_for(folder: &Path, format: Format) -> Result<Option<PathBuf>, SceneError
         Format::Polycam => polycam::look_for(folder),
         Format::Metashape => single(folder, "xml", metashape::is_one)?,
         Format::Realitycapture => single(folder, "csv", realitycapture::is_one)?,
+        Format::Opf => single(folder, "opf", opf::is_one)?,
         Format::Turntable => None,
     })
 }
@@ -284,11 +372,12 @@ fn single(folder: &Path, extension: &str, right: fn(&[u8]) -> bool) -> Result<Op
 }
 
 fn nothing(folder: &Path, format: Option<Format>) -> Result<SceneError, SceneError> {
-    let names: Vec<String> = entries(folder)?
-        .iter()
-        .take(8)
-        .filter_map(|p| p.file_name().map(|n| n.to_string_lossy().into_owned()))
-        .collect();
+    let there = entries(folder)?;
+    if let Some((file, kind)) = there.iter().find_map(|f| Some((f, unreadable_kind(f)?))) {
+        return Ok(In(file).unreadable(kind));
+    }
+    let names: Vec<String> =
+        there.iter().take(8).filter_map(|p| p.file_name().map(|n| n.to_string_lossy().into_owned())).collect();
     let found = if names.is_empty() { "an empty folder".into() } else { names.join(", ") };
     Ok(match format {
         Some(format) => {
@@ -352,28 +441,6 @@ pub(crate) fn inside(folder: &Path, name: &str) -> Option<PathBuf> {
     let relative = Path::new(&name);
     let normal = |c| matches!(c, std::path::Component::Normal(_) | std::path::Component::CurDir);
     (!name.is_empty() && !name.contains('\0') && relative.components().all(normal)).then(|| folder.join(relative))
-}
-
-/// The image called `name` in the first of `folders` that has it: as written, by its file name alone, or with an extension added.
-pub(crate) fn find_image(place: &str, name: &str, folders: &[PathBuf]) -> Result<PathBuf, SceneError> {
-    let alone = name.rsplit(['/', '\\']).next().unwrap_or(name);
-    for name in [name, alone] {
-        for path in folders.iter().filter_map(|folder| inside(folder, name)) {
-            if path.is_file() {
-                return Ok(path);
-            }
-            for extension in IMAGES.into_iter().chain(["JPG", "PNG", "JPEG"]) {
-                let mut longer = path.clone().into_os_string();
-                longer.push(".");
-                longer.push(extension);
-                if Path::new(&longer).is_file() {
-                    return Ok(longer.into());
-                }
-            }
-        }
-    }
-    let folders = folders.iter().map(|f| f.display().to_string()).collect();
-    Err(SceneError::MissingImage { place: place.into(), image: name.into(), folders })
 }
 
 /// A camera in pixels, its numbers checked. `size` is width and height, `focal` and `principal` x and y.

@@ -3,11 +3,10 @@
 //! `t_00` to `t_23` are camera to world, three rows of four, with OpenGL's camera axes and ARKit's world (y up). The world becomes z up,
 //! as nerfstudio makes it: x, y, z here are z, x, y there.
 
-use super::{
-    Cameras, Format, Intrinsics, Photo, bytes_of, entries, find_image, has_extension, pinhole, world_to_camera,
-};
-use crate::{SceneError, error::In};
+use super::{Cameras, Format, Intrinsics, Photo, Photos, bytes_of, entries, has_extension, pinhole, world_to_camera};
+use crate::{SceneError, error::In, load::size_of};
 use freerange_camera::{Camera, Lens};
+use freerange_core::Note;
 use glam::{DMat3, DVec3};
 use serde_json::{Map, Value};
 use std::path::{Path, PathBuf};
@@ -18,8 +17,9 @@ pub(super) fn look_for(scene: &Path) -> Option<PathBuf> {
     [scene.join("keyframes"), scene.to_path_buf()].into_iter().find(holds)
 }
 
-/// The camera of one JSON file.
-pub fn camera(file: &Path, bytes: &[u8]) -> Result<Camera, SceneError> {
+/// The camera of one JSON file; `size`: of its image, where the file does not say it.
+pub fn camera(file: &Path, bytes: &[u8], size: Option<(u32, u32)>) -> Result<Camera, SceneError> {
+    let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
     let root: Value = serde_json::from_slice(bytes).map_err(|e| In(file).malformed("", format!("not JSON: {e}")))?;
     let Value::Object(root) = root else {
         return Err(In(file).malformed("", "expected an object"));
@@ -39,7 +39,10 @@ pub fn camera(file: &Path, bytes: &[u8]) -> Result<Camera, SceneError> {
     let rows = [row(2)?, row(0)?, row(1)?];
     let column = |j: usize| DVec3::new(rows[0][j], rows[1][j], rows[2][j]);
     let pose = world_to_camera(file, "", DMat3::from_cols(column(0), -column(1), -column(2)), column(3))?;
-    let size = (side("width")?, side("height")?);
+    let size = match size.filter(|_| !root.contains_key("width") && !root.contains_key("height")) {
+        Some((width, height)) => (width.into(), height.into()),
+        None => (side("width")?, side("height")?),
+    };
     pinhole(file, "", size, [number("fx")?, number("fy")?], [number("cx")?, number("cy")?], pose)
 }
 
@@ -58,16 +61,18 @@ pub(super) fn read(folder: &Path, images_in: Option<&Path>) -> Result<Cameras, S
     };
     let images = images_in.map_or(images, Path::to_path_buf);
     let mut photos = Vec::new();
+    let mut found = Photos::new(&cameras, vec![images]);
     for file in entries(&cameras)?.into_iter().filter(|f| has_extension(f, &["json"])) {
-        let camera = camera(&file, &bytes_of(&file)?)?;
+        let bytes = bytes_of(&file)?;
         let name = file.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-        let image = find_image(&file.display().to_string(), &name, std::slice::from_ref(&images))?;
-        let intrinsics = Intrinsics::Pixels(camera);
+        let Some(image) = found.find(&name)? else { continue };
+        let intrinsics = Intrinsics::Pixels(camera(&file, &bytes, Some(size_of(&image)?))?);
         photos.push(Photo { name, image, mask: None, intrinsics, lens: Lens::Ideal, further: false });
     }
-    let mut notes = vec!["Polycam's world is turned to z up: x, y, z are its z, x, y".to_owned()];
+    let mut notes = vec![Note::understood("Polycam's world is turned to z up: x, y, z are its z, x, y")];
+    found.finish(&mut notes)?;
     if corrected && folder.join("cameras").is_dir() {
-        notes.push("Polycam's corrected cameras and images are read, not the original ones beside them".into());
+        notes.push(Note::dropped("Polycam's corrected cameras and images are read, not the original ones beside them"));
     }
-    Ok(Cameras { format: Format::Polycam, photos, files: vec![cameras], notes })
+    Ok(Cameras::new(Format::Polycam, photos, vec![cameras], notes))
 }

@@ -1,10 +1,14 @@
 //! Photos at even steps around an object, taken without poses.
 
 use super::{Cameras, Format, IMAGES, Intrinsics, Photo, entries, has_extension};
-use crate::SceneError;
-use freerange_camera::{Camera, Lens};
+use crate::{SceneError, error::In};
+use freerange_camera::{Camera, Lens, scene::unreadable_kind};
+use freerange_core::Note;
 use glam::DVec3;
-use std::{path::Path, str::FromStr};
+use std::{
+    path::{Path, PathBuf},
+    str::FromStr,
+};
 
 /// How the photos were taken: one full turn in even steps, the camera on one height and aimed at the object's middle.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -42,16 +46,32 @@ impl FromStr for Turntable {
 /// Distance of the cameras from the object: any will do, as nothing tells sizes.
 const DISTANCE: f64 = 1.75;
 
-/// The photos of a folder (or of its `images`), by name, numbers in names by value.
-pub(super) fn read(folder: &Path, turntable: &Turntable) -> Result<Cameras, SceneError> {
+/// The photos of a folder, or of its `images`.
+pub fn photos_in(folder: &Path) -> Result<Vec<PathBuf>, SceneError> {
     let inner = folder.join("images");
     let folder = if inner.is_dir() { inner } else { folder.to_path_buf() };
-    let mut images: Vec<_> =
-        entries(&folder)?.into_iter().filter(|p| p.is_file() && has_extension(p, &IMAGES)).collect();
-    if images.len() < 3 {
-        return Err(SceneError::TooFew { file: folder, expected: 3, found: images.len() });
+    let there = entries(&folder)?;
+    let images: Vec<_> = there.iter().filter(|p| p.is_file() && has_extension(p, &IMAGES)).cloned().collect();
+    if images.len() >= 3 {
+        return Ok(images);
     }
-    images.sort_by_cached_key(|p| by_value(&p.file_name().unwrap_or_default().to_string_lossy()));
+    match there.iter().find_map(|f| Some((f, unreadable_kind(f)?))) {
+        Some((file, kind)) => Err(In(file).unreadable(kind)),
+        None => Err(SceneError::TooFew { file: folder, expected: 3, found: images.len() }),
+    }
+}
+
+/// Photos in the order of their names, numbers in them by value: that in which cameras take them.
+pub fn in_order(photos: &[PathBuf]) -> Vec<PathBuf> {
+    let mut photos = photos.to_vec();
+    photos.sort_by_cached_key(|p| by_value(&p.file_name().unwrap_or_default().to_string_lossy()));
+    photos
+}
+
+/// The photos of a folder (or of its `images`), by name, numbers in names by value.
+pub(super) fn read(folder: &Path, turntable: &Turntable) -> Result<Cameras, SceneError> {
+    let images = in_order(&photos_in(folder)?);
+    let folder = images[0].parent().unwrap_or(folder).to_path_buf();
     let (count, elevation) = (images.len(), turntable.elevation.to_radians());
     let photos = images
         .into_iter()
@@ -69,19 +89,19 @@ pub(super) fn read(folder: &Path, turntable: &Turntable) -> Result<Cameras, Scen
                 name: image.file_name().unwrap_or_default().to_string_lossy().into_owned(),
                 image,
                 mask: None,
-                intrinsics: Intrinsics::Relative { focal, offset: [0.0; 2], world_to_camera },
+                intrinsics: Intrinsics::Relative { focal, offset: [0.0; 2], world_to_camera, upright: true },
                 lens: Lens::Ideal,
                 further: false,
             }
         })
         .collect();
     let way = if turntable.clockwise { "clockwise" } else { "counterclockwise" };
-    let notes = vec![format!(
+    let notes = vec![Note::assumed(format!(
         "{count} photos in order of their names are taken as one {way} turn of the object in even steps of {:.1} degrees; \
          sizes are relative to the cameras' distance, {DISTANCE}",
         360.0 / count as f64
-    )];
-    Ok(Cameras { format: Format::Turntable, photos, files: vec![folder], notes })
+    ))];
+    Ok(Cameras::new(Format::Turntable, photos, vec![folder], notes))
 }
 
 /// A name cut into texts and numbers, so that `9` comes before `10`.

@@ -1,0 +1,156 @@
+//! Programs that find poses: COLMAP's on the PATH, or pycolmap in a Python. Run as processes; their words go to a log.
+
+use std::{
+    fs::File,
+    io::{BufRead, BufReader},
+    path::{Path, PathBuf},
+    process::{Command, Stdio},
+};
+
+use serde::{Deserialize, Serialize};
+
+use crate::{error::CliError, progress::Progress};
+
+/// The script for pycolmap.
+const SCRIPT: &str = include_str!("engine.py");
+/// What is told of pycolmap's version by this.
+const PROBE: &str = "import pycolmap; print(pycolmap.__version__)";
+
+/// An engine that is there.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Engine {
+    /// pycolmap: the Python that has it, and its version.
+    Pycolmap(PathBuf, String),
+    /// COLMAP's programs: the file, and its version.
+    Colmap(PathBuf, String),
+}
+
+/// What an engine is asked for.
+#[derive(Serialize)]
+pub struct Job {
+    /// Where it works.
+    pub work: PathBuf,
+    /// The folder of the photos.
+    pub images: PathBuf,
+    /// The photos, in the order in which they were taken.
+    pub names: Vec<String>,
+    /// Those of one size, which share a camera.
+    pub groups: Vec<Vec<String>>,
+    /// A file with a pair of names on each line: photos taken one after the other.
+    pub pairs: PathBuf,
+    /// Slower features that hold under larger turns.
+    pub thorough: bool,
+    /// Contrast that a feature needs at least.
+    pub peak_threshold: f64,
+    /// A folder of masks as COLMAP has them.
+    pub masks: Option<PathBuf>,
+    /// Of all random numbers.
+    pub seed: u64,
+}
+
+/// What an engine did.
+#[derive(Deserialize, Serialize, Debug, Default)]
+pub struct Done {
+    /// Its name and version.
+    pub engine: String,
+    /// Photos in each of its models, the largest first.
+    pub models: Vec<usize>,
+    /// Which pairs were enough: neighbors or all.
+    pub pairs: Option<String>,
+    /// Points of the largest model.
+    pub points: usize,
+    /// Their mean distance from where they should appear, in pixels.
+    #[serde(default)]
+    pub reprojection_error: Option<f64>,
+}
+
+impl Engine {
+    /// pycolmap in `python`, where one is named; else COLMAP's programs on the PATH, else pycolmap in `python3`.
+    pub fn find(python: Option<&Path>) -> Result<Self, CliError> {
+        if let Some(python) = python {
+            return pycolmap(python).ok_or_else(|| {
+                let what = "expected a Python that has pycolmap (pip install pycolmap), found none there";
+                CliError::input(format!("--python {}: {what}", python.display()))
+            });
+        }
+        let found = colmap(Path::new("colmap")).or_else(|| pycolmap(Path::new("python3")));
+        found.ok_or_else(|| {
+            CliError::input(
+                "expected COLMAP on the PATH, or pycolmap in python3 (pip install pycolmap) or in --python PYTHON, found neither",
+            )
+        })
+    }
+
+    /// Name and version.
+    pub fn name(&self) -> String {
+        match self {
+            Self::Pycolmap(_, version) => format!("pycolmap {version}"),
+            Self::Colmap(_, version) => format!("COLMAP {version}"),
+        }
+    }
+
+    /// Finds poses: the model comes into `model` of the job's folder.
+    pub fn run(&self, job: &Job, log: &Path) -> Result<Done, CliError> {
+        match self {
+            Self::Pycolmap(python, _) => run_pycolmap(python, job, log),
+            Self::Colmap(program, version) => super::colmap::run(program, version, job, log),
+        }
+    }
+}
+
+/// The first line that a program says, if it says something and ends well.
+fn said(command: &mut Command) -> Option<String> {
+    let done = command.stdin(Stdio::null()).output().ok().filter(|done| done.status.success())?;
+    let text = String::from_utf8_lossy(&done.stdout).trim().lines().next()?.to_owned();
+    (!text.is_empty()).then_some(text)
+}
+
+fn pycolmap(python: &Path) -> Option<Engine> {
+    let version = said(Command::new(python).args(["-c", PROBE]))?;
+    Some(Engine::Pycolmap(python.into(), version))
+}
+
+fn colmap(program: &Path) -> Option<Engine> {
+    let line = said(Command::new(program).arg("help"))?;
+    let version = line.split_whitespace().find(|w| w.starts_with(|c: char| c.is_ascii_digit()))?;
+    Some(Engine::Colmap(program.into(), version.to_owned()))
+}
+
+fn run_pycolmap(python: &Path, job: &Job, log: &Path) -> Result<Done, CliError> {
+    let write = |name: &str, bytes: &[u8]| {
+        let path = job.work.join(name);
+        std::fs::write(&path, bytes).map_err(|e| CliError::file(&path, e)).map(|()| path)
+    };
+    let script = write("engine.py", SCRIPT.as_bytes())?;
+    let asked = write("job.json", &serde_json::to_vec_pretty(job).map_err(CliError::failure)?)?;
+    let errors = File::create(log).map_err(|e| CliError::file(log, e))?;
+    let mut command = Command::new(python);
+    command.arg(script).arg(asked).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(errors);
+    let mut child = command.spawn().map_err(|e| CliError::file(python, e))?;
+    let out = child.stdout.take().ok_or_else(|| CliError::failure("a process without output"))?;
+    // Features, then matches and a model of neighbors, then of all pairs if it comes to that.
+    let mut bar = Progress::new("poses", 5);
+    let mut step = 0;
+    for line in BufReader::new(out).lines().map_while(Result::ok) {
+        let Ok(told) = serde_json::from_str::<serde_json::Value>(&line) else { continue };
+        let (what, pairs) = (told["step"].as_str().unwrap_or(""), told["pairs"].as_str().unwrap_or(""));
+        step += u64::from(told["done"].as_u64().unwrap_or(0) == 0);
+        bar.at(step, &format!("{what} {pairs}"));
+    }
+    bar.finish();
+    let status = child.wait().map_err(|e| CliError::file(python, e))?;
+    if !status.success() {
+        return Err(failed("pycolmap", log));
+    }
+    let result = job.work.join("result.json");
+    let bytes = std::fs::read(&result).map_err(|e| CliError::file(&result, e))?;
+    serde_json::from_slice(&bytes).map_err(|e| CliError::file(&result, e))
+}
+
+/// An engine's failure, with the end of what it said.
+pub fn failed(engine: &str, log: &Path) -> CliError {
+    let text = std::fs::read(log).map(|b| String::from_utf8_lossy(&b).into_owned()).unwrap_or_default();
+    let last: Vec<&str> = text.lines().rev().filter(|l| !l.trim().is_empty()).take(2).collect();
+    let last: Vec<&str> = last.into_iter().rev().collect();
+    CliError::failure(format!("{engine} failed; {} ends with: {}", log.display(), last.join(" / ")))
+}

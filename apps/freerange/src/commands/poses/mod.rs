@@ -1,0 +1,195 @@
+//! `freerange poses`
+
+mod colmap;
+mod engine;
+mod judge;
+
+use std::{
+    collections::BTreeMap,
+    path::{Path, PathBuf},
+};
+
+use freerange_scene::read::{Format, cameras, in_order, photos_in};
+use serde::Serialize;
+
+use crate::{error::CliError, output::OutputFolder};
+use engine::{Done, Engine, Job};
+use judge::Judgement;
+
+/// How to photograph, for those whose photos could not be placed.
+const ADVICE: &str = "take 16 photos or more, 20 to 25 degrees apart, one way around the object, with a patterned cloth or newspaper below it";
+/// Photos below which features have to hold under larger turns.
+const MANY: usize = 16;
+/// Photos on either side that are compared first, as a share of all: those within 60 degrees of one turn.
+const NEIGHBORS: f64 = 1.0 / 6.0;
+
+/// Find the cameras of photos that have none, with COLMAP or pycolmap, and judge them.
+///
+/// Photos go once around the object, in the order of their names. Writes a scene that `reconstruct` takes: images/, sparse/0, poses.json (what
+/// was found and how it was judged) and poses.log (what the engine said). Poses that look wrong are refused with exit code 2; poses.json and
+/// poses.log are written all the same.
+#[derive(clap::Args)]
+pub struct Args {
+    /// Folder of photos.
+    photos: PathBuf,
+    /// Where the scene goes.
+    #[arg(short, long)]
+    output: PathBuf,
+    /// A Python that has pycolmap [default: COLMAP on the PATH, else python3].
+    #[arg(long, value_name = "PROGRAM")]
+    python: Option<PathBuf>,
+    /// The photos are not at even steps once around: uneven steps are told of, not refused.
+    #[arg(long)]
+    uneven: bool,
+    /// A folder of masks as COLMAP has them (NAME.jpg.png, black is passed over), for objects on a turntable.
+    #[arg(long, value_name = "FOLDER")]
+    masks: Option<PathBuf>,
+    /// Seed of the engine's random numbers.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Print what was found as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Serialize)]
+struct Report<'a> {
+    photos: &'a [String],
+    engine: &'a Done,
+    judgement: &'a Judgement,
+}
+
+/// Runs the command.
+pub fn run(args: &Args) -> Result<(), CliError> {
+    let photos = photos_in(&args.photos)?;
+    let names: Vec<String> =
+        in_order(&photos).iter().filter_map(|p| Some(p.file_name()?.to_string_lossy().into_owned())).collect();
+    if names.len() < 4 {
+        return Err(CliError::input(format!(
+            "{}: expected at least 4 photos, found {}; {ADVICE}",
+            args.photos.display(),
+            names.len()
+        )));
+    }
+    let engine = Engine::find(args.python.as_deref())?;
+    eprintln!("{} photos, {}", names.len(), engine.name());
+    let output = OutputFolder::create("poses", &args.output)?;
+    let work = tempfile::tempdir().map_err(CliError::failure)?;
+    for photo in &photos {
+        let to = output.path(&format!("images/{}", plain_name(photo)))?;
+        if to.exists() {
+            return Err(CliError::file(photo, "expected a name that differs from the others by more than spaces"));
+        }
+        std::fs::copy(photo, to).map_err(|e| CliError::file(photo, e))?;
+    }
+    let job = job(args, work.path(), &output.path("images")?, &photos, &names)?;
+    let done = engine.run(&job, &output.path("poses.log")?)?;
+    let mut judgement = Judgement::of_engine(&names, &done);
+    if judgement.refused.is_empty() {
+        for name in ["cameras.bin", "images.bin", "points3D.bin"] {
+            let from = work.path().join("model").join(name);
+            std::fs::copy(&from, output.path(&format!("sparse/0/{name}"))?).map_err(|e| CliError::file(&from, e))?;
+        }
+        let found = cameras(&output.path("sparse/0/cameras.bin")?, Some(Format::Colmap), None)?;
+        judgement.look(&found, &names, args.uneven)?;
+        if judgement.refused.is_empty() {
+            judgement.look_at_photos(&found)?;
+        }
+    }
+    if names.len() < MANY {
+        judgement.warnings.push(format!("{} photos are few: {MANY} or more are placed more surely", names.len()));
+    }
+    finish(args, &names, &done, &judgement, output)
+}
+
+/// Writes what was found, and says it.
+fn finish(
+    args: &Args,
+    names: &[String],
+    done: &Done,
+    judgement: &Judgement,
+    mut output: OutputFolder,
+) -> Result<(), CliError> {
+    let json =
+        serde_json::to_string_pretty(&Report { photos: names, engine: done, judgement }).map_err(CliError::failure)?;
+    if !judgement.refused.is_empty() {
+        // What is refused is no scene.
+        let log = std::fs::read(output.path("poses.log")?).unwrap_or_default();
+        output = OutputFolder::create("poses", &args.output)?;
+        output.write("poses.log", &log)?;
+    }
+    output.write("poses.json", json.as_bytes())?;
+    output.commit()?;
+    if args.json {
+        println!("{json}");
+    }
+    judgement.warnings.iter().for_each(|warning| eprintln!("warning: {warning}"));
+    if !judgement.refused.is_empty() {
+        let reasons = judgement.refused.join("; ");
+        let at = args.photos.display();
+        return Err(CliError::input(format!("{at}: no cameras that can be relied on: {reasons}; {ADVICE}")));
+    }
+    if !args.json {
+        let placed = names.len() - judgement.left_out.len();
+        println!("{}: {placed} of {} photos have cameras ({})", args.output.display(), names.len(), done.engine);
+    }
+    Ok(())
+}
+
+/// A photo's name without spaces, at which COLMAP's lists end names.
+fn plain_name(photo: &Path) -> String {
+    photo.file_name().unwrap_or_default().to_string_lossy().replace(char::is_whitespace, "_")
+}
+
+fn job(args: &Args, work: &Path, images: &Path, photos: &[PathBuf], names: &[String]) -> Result<Job, CliError> {
+    // One camera for each size.
+    let mut sizes: BTreeMap<(u32, u32), Vec<String>> = BTreeMap::new();
+    for photo in in_order(photos) {
+        let size = image::image_dimensions(&photo).map_err(|e| CliError::file(&photo, e))?;
+        sizes.entry(size).or_default().push(plain_name(&photo));
+    }
+    let pairs = work.join("pairs.txt");
+    std::fs::write(&pairs, ring(names)).map_err(|e| CliError::file(&pairs, e))?;
+    let absolute = |p: &Path| std::fs::canonicalize(p).map_err(|e| CliError::file(p, e));
+    Ok(Job {
+        work: work.into(),
+        images: absolute(images)?,
+        names: names.to_vec(),
+        groups: sizes.into_values().collect(),
+        pairs,
+        thorough: names.len() < MANY,
+        peak_threshold: if args.masks.is_some() { 0.0066 } else { 0.002 },
+        masks: args.masks.as_deref().map(absolute).transpose()?,
+        seed: args.seed,
+    })
+}
+
+/// Pairs of photos that are near to one another on one turn around, a line each.
+fn ring(names: &[String]) -> String {
+    let reach = ((names.len() as f64 * NEIGHBORS).round() as usize).max(2).min((names.len() - 1) / 2 + 1);
+    let mut lines = std::collections::BTreeSet::new();
+    for i in 0..names.len() {
+        for k in 1..=reach {
+            let j = (i + k) % names.len();
+            if i != j {
+                lines.insert((i.min(j), i.max(j)));
+            }
+        }
+    }
+    lines.into_iter().map(|(i, j)| format!("{} {}\n", names[i], names[j])).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn neighbors_on_a_ring_are_paired_once() {
+        let names: Vec<String> = (0..24).map(|i| i.to_string()).collect();
+        let pairs = ring(&names);
+        assert_eq!(pairs.lines().count(), 24 * 4);
+        assert!(pairs.contains("0 23\n") && pairs.contains("1 5\n") && !pairs.contains("0 5\n"));
+        let few: Vec<String> = (0..4).map(|i| i.to_string()).collect();
+        assert_eq!(ring(&few).lines().count(), 6);
+    }
+}
