@@ -13,6 +13,8 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
+use signals::{EXIT_CODE, Signals};
+
 /// Posed photos in, 3D Gaussians out.
 ///
 /// From as few as four posed images of an object, a diffusion transformer predicts a compact, complete set of 3D
@@ -76,6 +78,16 @@ fn main() -> ExitCode {
     end_with_a_closed_pipe();
     freerange_model::keep_freed_memory();
     let cli = Cli::parse();
+    // Before there are other threads. The other commands take signals themselves, or leave nothing behind.
+    if let Command::Reconstruct(_) | Command::Inspect(_) | Command::Render(_) | Command::Model(_) | Command::Data(_) =
+        cli.command
+    {
+        let taken = Signals::take().on_first(|| output::abandon(EXIT_CODE));
+        if let Err(e) = taken {
+            eprintln!("error: {e}");
+            return ExitCode::from(e.exit_code());
+        }
+    }
     // CubeCL tries several kernels for each job and reports each that a device cannot run; what matters ends as an error.
     let level = if cli.verbose { "debug" } else { "warn,cubecl_runtime=off,cubecl_wgpu=off" };
     let filter = tracing_subscriber::EnvFilter::try_from_default_env().unwrap_or_else(|_| level.into());

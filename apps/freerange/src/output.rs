@@ -1,9 +1,11 @@
-//! Result folders that are written whole or not at all.
+//! Result folders. Every file of a result is finished before the first one replaces a file of an older result, and an
+//! interrupt leaves nothing behind.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
     io::{ErrorKind, Write},
     path::{Component, Path, PathBuf},
+    sync::{Mutex, MutexGuard, PoisonError},
 };
 
 use freerange_core::write_atomically;
@@ -15,6 +17,23 @@ const RECORD: &str = ".freerange-files.json";
 
 /// The files of each command's result, relative to the folder.
 type Record = BTreeMap<String, BTreeSet<PathBuf>>;
+
+/// Temporary folders of all results in the making. Held while one of them is moved to its place.
+static STAGING: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
+
+fn staging() -> MutexGuard<'static, BTreeSet<PathBuf>> {
+    STAGING.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Removes what is in the making, and ends the process with this code. A result that is being moved to its place is
+/// finished before.
+pub fn abandon(code: u8) -> ! {
+    let staging = staging();
+    // What cannot be removed stays: there is nobody left to tell.
+    staging.iter().for_each(|folder| drop(std::fs::remove_dir_all(folder)));
+    // The lock is kept: nothing begins to move any more.
+    std::process::exit(code.into())
+}
 
 /// A folder in the making: files are written into a temporary folder beside it and moved over at the end, so that a
 /// failure leaves what was there before.
@@ -35,8 +54,11 @@ impl OutputFolder {
             _ => Path::new("."),
         };
         std::fs::create_dir_all(parent).map_err(|e| CliError::file(parent, e))?;
+        let mut all = staging();
         let staging = tempfile::Builder::new().prefix(".freerange-").tempdir_in(parent);
-        Ok(Self { command, target: target.into(), staging: staging.map_err(|e| CliError::file(parent, e))? })
+        let staging = staging.map_err(|e| CliError::file(parent, e))?;
+        all.insert(staging.path().into());
+        Ok(Self { command, target: target.into(), staging })
     }
 
     /// Where to write the file `name` for now. Folders in `name` are made.
@@ -65,6 +87,7 @@ impl OutputFolder {
             move |e| CliError::file(&path, e)
         };
         let target = &self.target;
+        let _moving = staging();
         std::fs::create_dir_all(target).map_err(at(target))?;
         let mut new = BTreeSet::new();
         files(self.staging.path(), Path::new(""), &mut new).map_err(at(target))?;
@@ -94,6 +117,12 @@ impl OutputFolder {
         }
         record.insert(self.command.into(), new);
         write_record(target, &record)
+    }
+}
+
+impl Drop for OutputFolder {
+    fn drop(&mut self) {
+        staging().remove(self.staging.path());
     }
 }
 

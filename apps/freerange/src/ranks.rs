@@ -92,12 +92,10 @@ impl Job {
     /// The device of this process. Where processes of one machine are to find one themselves, each takes another GPU.
     ///
     /// # Errors
-    /// As [`DeviceName::open`].
+    /// As [`DeviceName::open_telling`]; GPUs that cannot be opened are told of.
     pub fn open(&self, device: DeviceName) -> Result<Device, CliError> {
-        match (device, self.local) {
-            (DeviceName::Auto, [local, locals]) if locals > 1 => Ok(DeviceName::auto_of(local)),
-            _ => Ok(device.open()?),
-        }
+        let [local, _] = self.local;
+        Ok(device.open_telling(local, &mut |note| eprintln!("{note}"))?)
     }
 
     /// The ranks, with sums of what is on `device` made in this way. All ranks have to call it.

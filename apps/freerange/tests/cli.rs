@@ -272,10 +272,42 @@ fn bad_numbers_on_the_command_line() {
     refused(s.path(), &["--cfg-scale", "nan"], &["cfg_scale"]);
     refused(s.path(), &["--photometric=-1"], &["lambda_pg"]);
     refused(Path::new("no/such/scene"), &[], &["no/such/scene"]);
+    // Options are looked at before photos are, and guidance is for noise.
+    refused(Path::new("no/such/scene"), &["--detail", "99"], &["sample.detail"]);
+    refused(Path::new("no/such/scene"), &["--cfg-scale", "2"], &["sample.cfg_scale", "sample.start"]);
     let done = freerange(&["train", "tiny", "-o", "no/such/run", "--save-every", "0"]);
     let message = String::from_utf8_lossy(&done.stderr).into_owned();
     assert_eq!(done.status.code(), Some(2), "{message}");
     assert!(message.contains("--save-every") && !message.contains("panicked"), "{message}");
+}
+
+/// Asked to end in the middle of its work, it leaves nothing behind, and what was there before.
+#[test]
+#[cfg(unix)]
+fn an_interrupted_result_leaves_nothing() {
+    let place = tempfile::tempdir().unwrap();
+    let out = place.path().join("out");
+    std::fs::create_dir(&out).unwrap();
+    std::fs::write(out.join("gaussians.ply"), "old").unwrap();
+    let mut child = Command::new(env!("CARGO_BIN_EXE_freerange"))
+        .args(["reconstruct".as_ref(), example().as_os_str(), "-o".as_ref(), out.as_os_str()])
+        .stderr(std::process::Stdio::null())
+        .spawn()
+        .unwrap();
+    let names = || -> Vec<String> {
+        let entries = std::fs::read_dir(place.path()).unwrap();
+        entries.map(|e| e.unwrap().file_name().into_string().unwrap()).collect()
+    };
+    let begin = std::time::Instant::now();
+    while names().len() < 2 {
+        assert!(begin.elapsed().as_secs() < 120 && child.try_wait().unwrap().is_none(), "it does not begin");
+        std::thread::sleep(std::time::Duration::from_millis(5));
+    }
+    let asked = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    assert!(asked.success());
+    assert_eq!(child.wait().unwrap().code(), Some(130));
+    assert_eq!(names(), ["out"]);
+    assert_eq!(std::fs::read(out.join("gaussians.ply")).unwrap(), b"old");
 }
 
 /// A limit on the size of files stands for a disk that fills up: the write fails in the middle of gaussians.ply.

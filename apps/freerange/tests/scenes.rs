@@ -123,6 +123,50 @@ fn many_scenes_are_made_once_and_a_bad_one_ends_none() {
     assert_eq!(column(&rows, "scene"), ["empty"]);
 }
 
+/// White beside white is as good as can be; it has no finite PSNR, which JSON would not hold.
+#[test]
+fn a_view_that_sees_nothing_ends_no_batch() {
+    let place = tempfile::tempdir().unwrap();
+    let (list, out) = (place.path().join("list.txt"), place.path().join("out"));
+    for name in ["a", "b"] {
+        copy(&example(), &place.path().join(name));
+    }
+    fs::write(&list, "a\nb\n").unwrap();
+    // The first further view of one of them turns its back on the object.
+    let file = place.path().join("a/transforms_test.json");
+    let mut scene: Value = serde_json::from_slice(&fs::read(&file).unwrap()).unwrap();
+    let frame = &mut scene["frames"][0];
+    for row in 0..3 {
+        for column in [0, 2] {
+            let x = frame["transform_matrix"][row][column].as_f64().unwrap();
+            frame["transform_matrix"][row][column] = (-x).into();
+        }
+    }
+    let picture = place.path().join("a/test/000.png");
+    fs::write(&file, scene.to_string()).unwrap();
+    let (width, height) = image::image_dimensions(&picture).unwrap();
+    image::RgbaImage::new(width, height).save(&picture).unwrap();
+
+    let (code, rows, said) = made(&list, &out, &[]);
+    assert_eq!((code, column(&rows, "status")), (0, vec!["done", "done"]), "{said}");
+    let psnr = |row: &Value| row["further_views"]["psnr"].as_f64().unwrap();
+    assert!(psnr(&rows[0]) > psnr(&rows[1]) && psnr(&rows[0]).is_finite(), "{rows:?}");
+    let report: Value = serde_json::from_slice(&fs::read(out.join("a/report.json")).unwrap()).unwrap();
+    let views = report["samples"][0]["further_views"]["views"].as_array().unwrap();
+    assert!(views.iter().any(|view| view["psnr"].as_f64() == Some(100.0)), "{views:?}");
+    let (code, rows, said) = made(&list, &out, &[]);
+    assert_eq!((code, column(&rows, "status")), (0, vec!["kept", "kept"]), "{said}");
+
+    // A record that cannot be read does not stand in the way of a new one.
+    let record = out.join("a/scene.json");
+    let broken = fs::read_to_string(&record).unwrap().replace("\"seconds\": ", "\"seconds\": null, \"was\": ");
+    fs::write(&record, broken).unwrap();
+    let (code, _, said) = made(&list, &out, &[]);
+    assert!(code == 2 && said.contains("scene.json"), "{said}");
+    let (code, rows, said) = made(&list, &out, &["--restart"]);
+    assert_eq!((code, column(&rows, "status")), (0, vec!["done", "done"]), "{said}");
+}
+
 #[test]
 fn what_cannot_be_a_list_of_scenes_is_refused() {
     let place = tempfile::tempdir().unwrap();
@@ -160,6 +204,10 @@ fn photos_held_out_are_compared_with_and_not_used() {
     let done = run("001,003.png");
     assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
     let report: Value = serde_json::from_slice(&done.stdout).unwrap();
+    // What it was made by can be traced.
+    assert_eq!((&report["device"], &report["version"]), (&"cpu".into(), &env!("CARGO_PKG_VERSION").into()));
+    assert!(report["commit"].is_string() && report["settings_schema"].is_number());
+    assert_eq!(report["checkpoint_sha256"].as_str().map(str::len), Some(64));
     assert_eq!(report["held_out"], serde_json::json!(["001", "003"]));
     assert_eq!(report["views_shown"], serde_json::json!(["000", "002"]));
     // The scene's own four further views, and these two; which are not among the inputs.

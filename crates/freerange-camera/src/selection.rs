@@ -1,4 +1,4 @@
-//! Which of an object's views are shown to the model and which only score it (METHOD.md, section 10).
+//! Which of an object's views are shown to the model and which only score it.
 //!
 //! K-means on the camera centres; "full observation" shows one view of each cluster, "partial observation" only
 //! views of one cluster, and one fixed, broad set of other views scores both.

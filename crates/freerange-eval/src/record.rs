@@ -6,7 +6,7 @@ use freerange_metrics::Metric;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-/// From where the input views look (METHOD.md, section 10; the paper, Section 4).
+/// From where the input views look (the paper, Section 4).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ViewSet {

@@ -78,6 +78,12 @@ pub fn sampling(provenance: &serde_json::Value) -> Result<SampleConfig, Error> {
     Ok(sample)
 }
 
+/// Most views that a model with this provenance has seen at once in training; the paper's four where it does not say.
+pub fn network_views(provenance: &serde_json::Value) -> usize {
+    let most = provenance.pointer("/configuration/loss/input_views/1");
+    most.and_then(serde_json::Value::as_u64).and_then(|n| n.try_into().ok()).filter(|n| *n > 0).unwrap_or(4)
+}
+
 /// Reads this checkpoint, or the shipped one, with its encoder's weights if those are published ones.
 ///
 /// # Errors

@@ -114,28 +114,26 @@ impl fmt::Display for DeviceName {
 }
 
 impl DeviceName {
-    /// [`Auto`](Self::Auto) for the process of this number on its machine: of the GPUs that this program can use, the one of
-    /// that number, from the first on again where there are fewer; without any, the CPU.
-    pub fn auto_of(number: usize) -> Device {
-        let nth = |api: Api| {
-            let mut found = api.devices();
-            // No other one is opened: each would give memory to it.
-            let device = if found.is_empty() { return None } else { found.swap_remove(number % found.len()) };
-            matches!(properties(&device), Ok((_, true))).then_some(device)
-        };
-        Api::ALL.into_iter().find_map(nth).unwrap_or_else(Device::flex)
+    /// The device, without differentiation, and ready to use. See [`open_telling`](Self::open_telling).
+    ///
+    /// # Errors
+    /// As there.
+    pub fn open(self) -> Result<Device, Error> {
+        self.open_telling(0, &mut |_| {})
     }
 
-    /// The device, without differentiation, and ready to use.
+    /// The device, without differentiation, and ready to use. [`Auto`](Self::Auto) is the GPU of this `number` among those
+    /// of its kind, from the first on again where there are fewer, or the next one that can be used; without any, the CPU.
+    /// `tell` hears of GPUs that are there and cannot be opened. No other one is opened: each would give memory to it.
     ///
     /// # Errors
     /// If this program was built without it, or no such device is found or can be opened.
-    pub fn open(self) -> Result<Device, Error> {
+    pub fn open_telling(self, number: usize, tell: &mut dyn FnMut(&str)) -> Result<Device, Error> {
         match self {
             Self::Cpu => Ok(Device::flex()),
-            // A software rasteriser pretends to be a GPU, and is slower than the CPU used directly.
             Self::Auto => {
-                Ok(devices().into_iter().find(|d| d.gpu && d.problem.is_none()).map_or_else(Device::flex, |d| d.device))
+                let found = Api::ALL.map(|api| (api, api.devices()));
+                Ok(first_gpu(found, number, properties, tell).unwrap_or_else(Device::flex))
             }
             Self::Gpu(api, _) if !api.compiled() => Err(Error::NoDevice(format!(
                 "device {self}: this program was built without it; build it with `cargo build --release --features {}`",
@@ -159,6 +157,34 @@ impl DeviceName {
     }
 }
 
+/// The first device, from `number` on, that opens and is real hardware: a software rasteriser pretends to be a GPU, and is
+/// slower than the CPU used directly.
+fn first_gpu<T>(
+    found: impl IntoIterator<Item = (Api, Vec<T>)>,
+    number: usize,
+    open: impl Fn(&T) -> Result<(Properties, bool), String>,
+    tell: &mut dyn FnMut(&str),
+) -> Option<T> {
+    let mut broken = false;
+    for (api, mut devices) in found {
+        let count = devices.len();
+        for index in (0..count).map(|i| (number + i) % count) {
+            match open(&devices[index]) {
+                Ok((_, true)) => return Some(devices.swap_remove(index)),
+                Ok((_, false)) => {}
+                Err(problem) => {
+                    broken = true;
+                    tell(&format!("device {} could not be opened: {problem}", DeviceName::Gpu(api, index)));
+                }
+            }
+        }
+    }
+    if broken {
+        tell("no GPU could be opened: the CPU computes");
+    }
+    None
+}
+
 /// Refuses arithmetic that a device does not have.
 ///
 /// # Errors
@@ -166,12 +192,10 @@ impl DeviceName {
 pub fn require(compute: Compute, device: &Device) -> Result<(), Error> {
     match compute.supported(device) {
         true => Ok(()),
-        false => {
-            let name = devices().into_iter().find(|d| d.is(device)).map_or_else(|| "the device".into(), |d| d.name);
-            Err(Error::NoDevice(format!(
-                "{name} cannot compute in {compute:?}: choose another `compute` (see `freerange devices`)"
-            )))
-        }
+        false => Err(Error::NoDevice(format!(
+            "{} cannot compute in {compute:?}: choose another `compute` (see `freerange devices`)",
+            Listed::of(device).name
+        ))),
     }
 }
 
@@ -208,36 +232,51 @@ pub struct Listed {
     /// Why it cannot be used.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub problem: Option<String>,
-    #[serde(skip)]
-    device: Device,
 }
 
 impl Listed {
-    /// Whether this line is about `device`.
-    pub fn is(&self, device: &Device) -> bool {
-        &self.device == device
+    /// What is known of an opened device. No other one is opened.
+    pub fn of(device: &Device) -> Self {
+        let gpu = |api: Api| {
+            let index = api.devices().iter().position(|found| found == device)?;
+            Some(Self::gpu(api, index, device))
+        };
+        Api::ALL.into_iter().find_map(gpu).unwrap_or_else(Self::cpu)
+    }
+
+    fn gpu(api: Api, index: usize, device: &Device) -> Self {
+        let name = DeviceName::Gpu(api, index).to_string();
+        match properties(device) {
+            Ok((properties, gpu)) => Self { name, gpu, properties, problem: None },
+            Err(problem) => Self { name, gpu: false, properties: Properties::default(), problem: Some(problem) },
+        }
+    }
+
+    fn cpu() -> Self {
+        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        let hardware = format!("{}, {cores} threads", crate::machine::processor());
+        let properties = Properties { hardware, memory_bytes: crate::machine::memory(), ..Properties::default() };
+        Self { name: "cpu".into(), gpu: false, properties, problem: None }
     }
 }
 
-/// Every device that this program can use, the best first; the CPU last.
-pub fn devices() -> Vec<Listed> {
-    let mut listed = Vec::new();
-    for api in Api::ALL {
-        for (index, device) in api.devices().into_iter().enumerate() {
-            let name = DeviceName::Gpu(api, index).to_string();
-            listed.push(match properties(&device) {
-                Ok((properties, gpu)) => Listed { name, gpu, properties, problem: None, device },
-                Err(problem) => {
-                    Listed { name, gpu: false, properties: Properties::default(), problem: Some(problem), device }
-                }
-            });
+/// As reports say it: `cpu`, or the name of a GPU with its maker's.
+impl fmt::Display for Listed {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.gpu {
+            true => write!(f, "{} ({})", self.name, self.properties.hardware),
+            false => f.write_str(&self.name),
         }
     }
-    let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    let hardware = format!("{}, {cores} threads", crate::machine::processor());
-    let properties = Properties { hardware, memory_bytes: crate::machine::memory(), ..Properties::default() };
-    listed.push(Listed { name: "cpu".into(), gpu: false, properties, problem: None, device: Device::flex() });
-    listed
+}
+
+/// Every device that this program can use, the best first; the CPU last. Opens all of them.
+pub fn devices() -> Vec<Listed> {
+    let of = |api: Api| {
+        let gpu = move |(index, device): (usize, Device)| Listed::gpu(api, index, &device);
+        api.devices().into_iter().enumerate().map(gpu)
+    };
+    Api::ALL.into_iter().flat_map(of).chain([Listed::cpu()]).collect()
 }
 
 /// Properties, and whether the device is real hardware. Opens it.
@@ -293,6 +332,37 @@ mod tests {
         for bad in ["", "gpu", "CPU", "cpu:0", "auto:1", "cuda:", "cuda:-1", "cuda:x", "cuda:0:1"] {
             assert!(bad.parse::<DeviceName>().is_err(), "{bad}");
         }
+    }
+
+    #[test]
+    fn only_the_gpu_that_is_used_is_opened_and_broken_ones_are_told() {
+        let choose = |number: usize, states: [&[char]; 2]| {
+            let opened = std::cell::RefCell::new(String::new());
+            let mut told = Vec::new();
+            let open = |state: &char| {
+                opened.borrow_mut().push(*state);
+                match state.to_ascii_lowercase() {
+                    'x' => Err("driver".to_owned()),
+                    // A letter of hardware, or `-` for a processor that plays it.
+                    state => Ok((Properties::default(), state != '-')),
+                }
+            };
+            let found = [Api::Cuda, Api::Vulkan].into_iter().zip(states.map(<[char]>::to_vec));
+            let chosen = first_gpu(found, number, open, &mut |note| told.push(note.to_owned()));
+            (chosen, opened.into_inner(), told)
+        };
+        assert_eq!(choose(0, [&['a', 'b'], &['c']]), (Some('a'), "a".into(), vec![]));
+        assert_eq!(choose(3, [&['a', 'b'], &['c']]), (Some('b'), "b".into(), vec![]));
+        assert_eq!(choose(1, [&[], &['-', 'c']]), (Some('c'), "c".into(), vec![]));
+        assert_eq!(choose(0, [&[], &['-']]), (None, "-".into(), vec![]));
+        let (chosen, opened, told) = choose(0, [&['x'], &['c']]);
+        assert_eq!((chosen, opened.as_str(), told.len()), (Some('c'), "xc", 1));
+        assert!(told[0].contains("cuda:0 could not be opened: driver"), "{told:?}");
+        let (chosen, _, told) = choose(0, [&['x'], &['-', 'x']]);
+        assert_eq!((chosen, told.len()), (None, 3));
+        assert!(told[1].contains("vulkan:1") && told[2].contains("the CPU computes"), "{told:?}");
+        let cpu = Listed::of(&Device::flex());
+        assert_eq!((cpu.name.as_str(), cpu.to_string().as_str(), cpu.problem), ("cpu", "cpu", None));
     }
 
     #[test]

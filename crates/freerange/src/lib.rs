@@ -41,7 +41,7 @@ mod score;
 
 pub use burn::tensor::Device;
 pub use checkpoint::{
-    EncoderPlaces, checkpoint_bytes, checkpoint_header, checkpoint_sha256, load_checkpoint, sampling,
+    EncoderPlaces, checkpoint_bytes, checkpoint_header, checkpoint_sha256, load_checkpoint, network_views, sampling,
 };
 pub use device::{Api, DeviceName, Listed, Properties, devices, require};
 pub use error::Error;

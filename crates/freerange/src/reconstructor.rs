@@ -104,8 +104,7 @@ impl Reconstructor {
 
     /// Most views that the model has seen at once in training; the paper's four where its checkpoint does not tell.
     pub fn views(&self) -> usize {
-        let told = self.checkpoint.provenance.pointer("/configuration/loss/input_views/1");
-        told.and_then(serde_json::Value::as_u64).and_then(|n| n.try_into().ok()).filter(|n| *n > 0).unwrap_or(4)
+        crate::network_views(&self.checkpoint.provenance)
     }
 
     /// Gaussians that it makes by default, before refinement; of a pixel-aligned model for as many views as it is shown.

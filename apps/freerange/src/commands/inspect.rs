@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use freerange::{DeviceName, Reconstructor, choose_views, to_canonical};
+use freerange::{checkpoint_header, choose_views, network_views, to_canonical};
 use freerange_camera::transforms_json;
 use freerange_scene::{
     inspect::{Inspection, inspect, sheet},
@@ -13,6 +13,7 @@ use crate::{
     error::CliError,
     output::OutputFolder,
     photos::{Photos, UpChoice},
+    runtime::local_or_shipped,
 };
 
 /// Show what is understood of a scene: cameras, masks, place and size of the object, and what may go wrong.
@@ -31,6 +32,9 @@ pub struct Args {
     /// Which way is up in the scene's frame: z, y, cameras (where the tops of the photos point), a direction X,Y,Z, or auto.
     #[arg(long, default_value = "auto", allow_hyphen_values = true)]
     up: UpChoice,
+    /// Model whose number of views is taken, instead of the shipped one's: as in `reconstruct`.
+    #[arg(long, value_name = "FILE", conflicts_with = "views")]
+    checkpoint: Option<PathBuf>,
     /// Views that the model would be shown [default: as `reconstruct`].
     #[arg(long, value_name = "K", value_parser = clap::value_parser!(u16).range(1..=256))]
     views: Option<u16>,
@@ -47,7 +51,10 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     let scene = args.photos.load(args.photos.cameras(&args.scene)?, args.up)?;
     let views = match args.views {
         Some(k) => usize::from(k),
-        None => Reconstructor::shipped(&DeviceName::Cpu.open()?)?.views(),
+        None => {
+            let checkpoint = local_or_shipped(args.checkpoint.as_deref())?;
+            network_views(&checkpoint_header(checkpoint.as_deref())?.provenance)
+        }
     };
     let (frame, _) = to_canonical(&scene.loaded.views, &scene.frame)?;
     let shown = choose_views(&scene.loaded.views, views)?;

@@ -10,8 +10,8 @@ use std::{
 };
 
 use freerange::{
-    Cloud, Compute, Device, DeviceName, EncoderPlaces, Options, Reconstructor, SETTINGS_SCHEMA, SampleConfig, Scores,
-    Solver, Stage, View,
+    Cloud, Compute, Device, DeviceName, EncoderPlaces, Listed, Options, Reconstructor, SETTINGS_SCHEMA, SampleConfig,
+    Scores, Solver, Stage, View, checkpoint_sha256,
     pictures::{on_white, render_view, write_turntable},
     score,
 };
@@ -32,7 +32,7 @@ use crate::{
     photos::{Photos, Scene, UpChoice},
     progress::Progress,
     ranks::Job,
-    runtime::local,
+    runtime::{commit, local, local_or_shipped},
 };
 use holdout::Holdout;
 
@@ -167,7 +167,7 @@ pub struct Sampling {
     /// Make 2^DEPTH Gaussians [default: the depth of the level-of-detail tree that the checkpoint was trained at].
     #[arg(long, value_parser = clap::value_parser!(u32).range(4..=16))]
     pub depth: Option<u32>,
-    /// Classifier-free guidance scale s; 1 is none [default: the checkpoint's].
+    /// Classifier-free guidance scale s; 1 is none, and goes alone with a start from a fit [default: the checkpoint's].
     #[arg(long = "cfg-scale", alias = "guidance")]
     pub guidance: Option<f32>,
     /// Photometric guidance scale lambda; 0 is none [default: the checkpoint's].
@@ -224,6 +224,11 @@ impl Sampling {
             Some(path) => Reconstructor::load(&local(path)?, &EncoderPlaces::at(self.encoder_weights.clone()), device)?,
             None => Reconstructor::shipped(device)?,
         })
+    }
+
+    /// SHA-256 of that model's checkpoint.
+    pub fn checkpoint_sha256(&self) -> Result<String, CliError> {
+        Ok(checkpoint_sha256(local_or_shipped(self.checkpoint.as_deref())?.as_deref())?)
     }
 
     /// The model's own way to sample, with what the user overrides.
@@ -291,9 +296,30 @@ impl Watch {
     }
 }
 
+/// What a result was made by.
+#[derive(Clone, Serialize)]
+struct Program {
+    /// Version and commit of the program.
+    version: &'static str,
+    commit: String,
+    /// Where it was computed.
+    device: String,
+    checkpoint_sha256: String,
+}
+
+impl Program {
+    fn of(model: &Reconstructor, checkpoint_sha256: String) -> Self {
+        let device = Listed::of(model.device()).to_string();
+        Self { version: env!("CARGO_PKG_VERSION"), commit: commit(), device, checkpoint_sha256 }
+    }
+}
+
 #[derive(Serialize)]
 struct SceneReport {
     scene: PathBuf,
+    /// What made it.
+    #[serde(flatten)]
+    program: Program,
     /// What was understood, assumed, changed or left out, and what may make the result wrong.
     notes: Vec<Note>,
     settings_schema: u32,
@@ -347,10 +373,13 @@ fn run_in(args: &Args, job: &Job) -> Result<(), CliError> {
     }
     let begin = Instant::now();
     let path = &args.scene[0];
-    let device = args.sampling.device.open()?;
-    let scene = args.photos.load(args.photos.cameras(path)?, args.sampling.up)?;
+    let device = job.open(args.sampling.device)?;
     let model = args.sampling.open(&device)?;
-    let (report, json) = reconstruct(args, path, scene, &model, &args.output, begin, || Ok(()))?;
+    // What cannot be done is refused before photos are read and cut out.
+    args.sampling.options(&model, args.samples)?;
+    let program = Program::of(&model, args.sampling.checkpoint_sha256()?);
+    let scene = args.photos.load(args.photos.cameras(path)?, args.sampling.up)?;
+    let (report, json) = reconstruct(args, path, scene, &model, &program, &args.output, begin, || Ok(()))?;
     match args.json {
         true => {
             tell(&report.notes);
@@ -384,6 +413,7 @@ fn reconstruct(
     path: &Path,
     scene: Scene,
     model: &Reconstructor,
+    program: &Program,
     folder: &Path,
     begin: Instant,
     commit: impl FnOnce() -> Result<(), CliError>,
@@ -467,6 +497,7 @@ fn reconstruct(
     notes.extend(result.notes.into_iter().map(Note::understood));
     let report = SceneReport {
         scene: path.into(),
+        program: program.clone(),
         notes,
         settings_schema: SETTINGS_SCHEMA,
         origin,

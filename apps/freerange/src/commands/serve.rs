@@ -15,6 +15,7 @@ use image::RgbaImage;
 use crate::{
     commands::reconstruct::{Sampling, StartName},
     error::CliError,
+    ranks::Job,
     signals::Signals,
 };
 
@@ -93,7 +94,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     unsafe {
         libc::signal(libc::SIGPIPE, libc::SIG_IGN);
     }
-    let device = args.sampling.device.open()?;
+    let device = Job::alone().open(args.sampling.device)?;
     let model = args.sampling.open(&device)?;
     args.sampling.options(&model, 1)?;
     let place = match &args.sampling.checkpoint {

@@ -1,4 +1,4 @@
-//! The canonical frame: where the model expects an object to be (METHOD.md, section 2).
+//! The canonical frame: where the model expects an object to be.
 //!
 //! The object lies in a sphere of radius 0.5 about the origin, +z is up, and cameras stand some 1.5 to 2 away. The
 //! similarity found here takes a user's scene there; its inverse takes the result back to the user's own frame.

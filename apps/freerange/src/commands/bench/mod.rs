@@ -5,10 +5,15 @@ mod sums;
 mod timer;
 mod whole;
 
-use freerange::{Compute, Device, DeviceName, devices, require};
+use freerange::{Compute, Device, DeviceName, Listed, require};
 use serde::Serialize;
 
-use crate::{commands::reconstruct::parse_compute, error::CliError, ranks::Sums, runtime};
+use crate::{
+    commands::reconstruct::parse_compute,
+    error::CliError,
+    ranks::{Job, Sums},
+    runtime,
+};
 
 /// Measure speed on a device: the rasteriser, a transformer block, sampling, training.
 ///
@@ -105,10 +110,8 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     if args.only.contains(&Part::Sum) {
         return sums::run(args);
     }
-    let device = args.device.open()?;
-    let listed = devices().into_iter().find(|d| d.is(&device));
-    let (name, hardware, gpu) = listed
-        .map_or_else(|| (args.device.to_string(), "unknown".into(), false), |d| (d.name, d.properties.hardware, d.gpu));
+    let device = Job::alone().open(args.device)?;
+    let Listed { name, gpu, properties, .. } = Listed::of(&device);
     let compute = args.compute.unwrap_or(Compute::Auto).on(&device);
     require(compute, &device)?;
     let sizes = match args.sizes.is_empty() {
@@ -119,7 +122,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     let timer = timer::Timer { device: device.clone(), seconds: args.seconds };
     let mut report = BenchReport {
         device: name,
-        hardware,
+        hardware: properties.hardware,
         commit: runtime::commit(),
         version: env!("CARGO_PKG_VERSION"),
         command: std::env::args().collect::<Vec<_>>().join(" "),

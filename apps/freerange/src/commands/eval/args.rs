@@ -2,7 +2,7 @@
 
 use std::{path::PathBuf, sync::Arc};
 
-use freerange::{Device, SETTINGS_SCHEMA, checkpoint_sha256, machine};
+use freerange::{Device, Listed, SETTINGS_SCHEMA, machine};
 use freerange_core::Share;
 use freerange_eval::{
     Environment, Scorer, ScorerConfig,
@@ -16,12 +16,7 @@ use super::{
     methods::{Method, MethodName, fit_config},
     sources::{Source, SourceArgs},
 };
-use crate::{
-    commands::reconstruct::Sampling,
-    error::CliError,
-    ranks::Job,
-    runtime::{commit, local_or_shipped},
-};
+use crate::{commands::reconstruct::Sampling, error::CliError, ranks::Job, runtime::commit};
 
 /// What is evaluated, and how.
 #[derive(clap::Args)]
@@ -157,7 +152,7 @@ impl RunArgs {
                         "--method start: expected a checkpoint that starts from a quick fit, or --start fit",
                     );
                 }
-                let sha256 = checkpoint_sha256(local_or_shipped(self.sampling.checkpoint.as_deref())?.as_deref())?;
+                let sha256 = self.sampling.checkpoint_sha256()?;
                 Method::Model { model: Arc::new(model), options: Box::new(options), sha256 }
             }
             MethodName::Fit => {
@@ -224,11 +219,7 @@ impl RunArgs {
             processor: machine::processor(),
             threads: std::thread::available_parallelism().map_or(1, usize::from),
             memory_bytes: machine::memory(),
-            device: match freerange::devices().into_iter().find(|d| d.is(device)) {
-                Some(d) if d.gpu => format!("{} ({})", d.name, d.properties.hardware),
-                Some(d) => d.name,
-                None => self.sampling.device.to_string(),
-            },
+            device: Listed::of(device).to_string(),
         }
     }
 }

@@ -1,19 +1,19 @@
 //! Many scenes: each in a folder of its own, as often interrupted as one likes, and a table at the end.
 
 use std::{
-    collections::{BTreeMap, BTreeSet},
+    collections::{BTreeMap, BTreeSet, HashMap},
     io::Write,
     path::{Path, PathBuf},
     time::{Instant, UNIX_EPOCH},
 };
 
-use freerange::{Reconstructor, SETTINGS_SCHEMA, Scores, checkpoint_sha256};
+use freerange::{Reconstructor, SETTINGS_SCHEMA, Scores};
 use freerange_core::write_atomically;
 use freerange_flow::ranks::gather;
 use serde::{Deserialize, Serialize};
 
-use super::{Args, SceneReport};
-use crate::{error::CliError, ranks::Job, runtime::local_or_shipped};
+use super::{Args, Program, SceneReport};
+use crate::{error::CliError, ranks::Job};
 
 /// In each scene's folder, once it is finished: what it was made with, and how it went.
 const RECORD: &str = "scene.json";
@@ -84,7 +84,7 @@ pub fn asked(args: &Args) -> bool {
 
 /// Runs the command on many scenes.
 pub fn run(args: &Args, job: &Job) -> Result<(), CliError> {
-    let Prepared { own, model, options, before } = job.together(Prepared::new(args, job))?;
+    let Prepared { own, model, program, options, before } = job.together(Prepared::new(args, job))?;
     let (mut rows, mut code) = (Vec::new(), 0);
     for (i, ((number, entry), record)) in own.iter().zip(before).enumerate() {
         let begin = Instant::now();
@@ -97,7 +97,7 @@ pub fn run(args: &Args, job: &Job) -> Result<(), CliError> {
             further_views: None,
             seconds: begin.elapsed().as_secs_f64(),
         };
-        let row = one(args, entry, record.filter(|_| !args.restart), &model, &options).unwrap_or_else(|error| {
+        let row = one(args, entry, record, &model, &program, &options).unwrap_or_else(|error| {
             // A failure of ours weighs more than input that cannot be used.
             code = if code == 1 { 1 } else { error.exit_code() };
             failed(&error)
@@ -143,6 +143,7 @@ struct Prepared {
     /// The scenes of this process, with their numbers in the list.
     own: Vec<(usize, Entry)>,
     model: Reconstructor,
+    program: Program,
     options: BTreeMap<String, String>,
     /// What is known of each of them from before.
     before: Vec<Option<Record>>,
@@ -160,16 +161,20 @@ impl Prepared {
         let own: Vec<(usize, Entry)> = entries.into_iter().enumerate().filter(|(i, _)| i % count == index).collect();
         let device = job.open(args.sampling.device)?;
         let model = args.sampling.open(&device)?;
-        let options = options(args, &model)?;
-        let before = own.iter().map(|(_, e)| recorded(&args.output.join(&e.name))).collect::<Result<Vec<_>, _>>()?;
-        if !args.restart {
-            for ((_, entry), record) in own.iter().zip(&before) {
-                if let Some(record) = record {
-                    same_options(&args.output.join(&entry.name).join(RECORD), &record.options, &options)?;
-                }
+        let checkpoint = args.sampling.checkpoint_sha256()?;
+        let program = Program::of(&model, checkpoint.clone());
+        let options = options(args, &model, checkpoint)?;
+        let before = match args.restart {
+            // Whatever lies there, none of it counts.
+            true => own.iter().map(|_| None).collect(),
+            false => own.iter().map(|(_, e)| recorded(&args.output.join(&e.name))).collect::<Result<Vec<_>, _>>()?,
+        };
+        for ((_, entry), record) in own.iter().zip(&before) {
+            if let Some(record) = record {
+                same_options(&args.output.join(&entry.name).join(RECORD), &record.options, &options)?;
             }
         }
-        Ok(Self { own, model, options, before })
+        Ok(Self { own, model, program, options, before })
     }
 }
 
@@ -221,18 +226,24 @@ fn named(scenes: Vec<PathBuf>) -> Result<Vec<Entry>, CliError> {
         })
         .collect();
     let longest = parts.iter().map(Vec::len).max().unwrap_or(0);
-    let tail = |parts: &[String], depth: usize| parts[parts.len().saturating_sub(depth)..].join("-");
-    let mut names = Vec::new();
-    for (i, own) in parts.iter().enumerate() {
-        let alone = |depth: &usize| {
-            let name = tail(own, *depth);
-            !name.is_empty() && parts.iter().enumerate().all(|(j, p)| i == j || tail(p, *depth) != name)
-        };
-        let Some(depth) = (1..=longest).find(alone) else {
-            return Err(CliError::file(&scenes[i], "expected every scene once, found it twice"));
-        };
-        names.push(tail(own, depth));
+    let mut found: Vec<Option<String>> = vec![None; parts.len()];
+    for depth in 1..=longest {
+        if !found.contains(&None) {
+            break;
+        }
+        let tails: Vec<String> = parts.iter().map(|p| p[p.len().saturating_sub(depth)..].join("-")).collect();
+        let mut count: HashMap<&str, usize> = HashMap::new();
+        tails.iter().for_each(|tail| *count.entry(tail).or_default() += 1);
+        for (name, tail) in found.iter_mut().zip(&tails) {
+            if name.is_none() && !tail.is_empty() && count[tail.as_str()] == 1 {
+                *name = Some(tail.clone());
+            }
+        }
     }
+    if let Some(twice) = found.iter().position(Option::is_none) {
+        return Err(CliError::file(&scenes[twice], "expected every scene once, found it twice"));
+    }
+    let names: Vec<String> = found.into_iter().flatten().collect();
     let different: BTreeSet<&String> = names.iter().collect();
     if different.len() < names.len() {
         return Err(CliError::input(format!("expected scenes with names of their own, found {}", names.join(", "))));
@@ -241,9 +252,8 @@ fn named(scenes: Vec<PathBuf>) -> Result<Vec<Entry>, CliError> {
 }
 
 /// What is not the same if the result is not.
-fn options(args: &Args, model: &Reconstructor) -> Result<BTreeMap<String, String>, CliError> {
+fn options(args: &Args, model: &Reconstructor, checkpoint: String) -> Result<BTreeMap<String, String>, CliError> {
     let sampling = args.sampling.options(model, args.samples)?;
-    let checkpoint = checkpoint_sha256(local_or_shipped(args.sampling.checkpoint.as_deref())?.as_deref())?;
     let mut formats: Vec<String> = args.format.iter().map(ToString::to_string).collect();
     formats.sort();
     let mut told = BTreeMap::from([
@@ -299,6 +309,7 @@ fn one(
     entry: &Entry,
     record: Option<Record>,
     model: &Reconstructor,
+    program: &Program,
     options: &BTreeMap<String, String>,
 ) -> Result<Row, CliError> {
     let begin = Instant::now();
@@ -312,7 +323,7 @@ fn one(
     }
     let folder = args.output.join(&entry.name);
     let scene = args.photos.load(cameras, args.sampling.up)?;
-    let (report, _) = super::reconstruct(args, &entry.scene, scene, model, &folder, begin, || forget(&folder))?;
+    let (report, _) = super::reconstruct(args, &entry.scene, scene, model, program, &folder, begin, || forget(&folder))?;
     let row = row(entry, &report, begin.elapsed().as_secs_f64());
     let record = Record {
         version: env!("CARGO_PKG_VERSION").into(),
@@ -403,6 +414,10 @@ mod tests {
         assert_eq!(names(&["/mug", "/b/mug"]).unwrap(), ["mug", "b-mug"]);
         assert!(names(&["/a/mug", "/a/mug"]).unwrap_err().contains("twice"));
         assert!(names(&["/x/a/b", "/y/a/b", "/z/a-b"]).is_ok());
+        // As many as an array of jobs may have, each known by its grandparent: no pairs are compared.
+        let many: Vec<String> = (0..20_000).map(|i| format!("/scans/{i}/photos/mug")).collect();
+        let many: Vec<&str> = many.iter().map(String::as_str).collect();
+        assert_eq!(names(&many).unwrap()[19_999], "19999-photos-mug");
     }
 
     #[test]
