@@ -3,14 +3,14 @@
     pip install usd-core==26.11 numpy plyfile
     python tools/formats/usd_vectors.py tests/golden/formats
 
-source.usdc has 32-bit attributes on a prim that two transforms place; half.usda 16-bit ones, +z up, degree 0.
+placed.usdz has 32-bit attributes on a prim that two transforms place; half.usda 16-bit ones, +z up, degree 0.
 """
 import sys
 from pathlib import Path
 
 import numpy as np
 from plyfile import PlyData
-from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+from pxr import Gf, Usd, UsdGeom, UsdUtils, Vt
 
 folder = Path(sys.argv[1])
 rows = PlyData.read(str(folder / "source.ply"))["vertex"]
@@ -42,7 +42,7 @@ def write(prim, half, coefficients, degree):
     prim.GetAttribute("radiance:sphericalHarmonicsDegree").Set(degree)
 
 
-stage = Usd.Stage.CreateNew(str(folder / "source.usdc"))
+stage = Usd.Stage.CreateNew(str(folder / "placed.usda"))
 UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
 UsdGeom.SetStageMetersPerUnit(stage, 1.0)
 root = UsdGeom.Xform.Define(stage, "/World")
@@ -54,6 +54,8 @@ degree = int(round((each + 1) ** 0.5)) - 1
 write(splats, False, np.concatenate([constant[:, None], rest], 1), degree)
 stage.SetDefaultPrim(root.GetPrim())
 stage.GetRootLayer().Save()
+UsdUtils.CreateNewUsdzPackage(str(folder / "placed.usda"), str(folder / "placed.usdz"))
+(folder / "placed.usda").unlink()
 
 stage = Usd.Stage.CreateNew(str(folder / "half.usda"))
 UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)

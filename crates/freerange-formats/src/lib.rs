@@ -7,7 +7,7 @@
 //! | `.spz` | versions 1 to 4 | version 3, or 2, or 4 | +y up, right-handed |
 //! | `.sog` | version 2, also as a folder (`meta.json`) | version 2 | the user's |
 //! | `.glb` | `KHR_gaussian_splatting`, also as `.gltf` | the same, lossless but for rounding | +y up by the turn of a node; attributes in the user's |
-//! | `.usda`, `.usdz` | `ParticleField3DGaussianSplat`, also `.usdc`, `.usd` | the same, lossless but for rounding | +z or +y up, as the stage says |
+//! | `.usda`, `.usdz` | `ParticleField3DGaussianSplat`, text; also as `.usd` | the same, lossless but for rounding | +z or +y up, as the stage says |
 //! | `.html` | our own | a viewer with the splats inside, lossless | the user's |
 //!
 //! Files that do not fix their frame are in the user's, of which [`Frame`] knows the way up. Color that depends on the
@@ -30,6 +30,7 @@ mod spz;
 mod spz_read;
 mod usd;
 mod usd_read;
+mod usd_text;
 pub mod viewer;
 
 use std::{fmt, fs::File, io::Read, io::Write, path::Path};

@@ -149,11 +149,11 @@ fn harmonics(splats: &Splats, files: &mut Vec<(String, Vec<u8>)>) -> Option<Harm
     Some(Harmonic { count: count as u64, bands: splats.harmonics.degree(), codebook: codes, files: names })
 }
 
-/// At most 2^16 rows that stand for those of `data`, and which one does for each. Exact for few; else a 16th of them
-/// (1024 at least), by halving the group whose spread is largest along its widest column.
+/// At most 2^16 rows that stand for those of `data`, and which one does for each. Exact for few; else a quarter of them
+/// (4096 at least), by halving the group whose spread is largest along its widest column.
 fn palette(data: &[f32], width: usize) -> (Vec<u16>, Vec<f32>) {
     let n = data.len() / width;
-    let most = (n / 16).clamp(1024, 1 << 16);
+    let most = (n / 4).clamp(4096, 1 << 16);
     if n <= most {
         return ((0..n).map(|i| i as u16).collect(), data.to_vec());
     }
@@ -241,7 +241,7 @@ fn with_alpha([r, g, b]: [u8; 3], alpha: u8) -> [u8; 4] {
 }
 
 /// Most different values that codes are chosen for; more are put together, next to each other.
-const MOST_VALUES: usize = 1 << 14;
+const MOST_VALUES: usize = 1 << 12;
 
 /// [`CODES`] numbers in order that stand for `values` with the least squared error. Exact where there are no more
 /// different values than codes.

@@ -107,7 +107,7 @@ fn glb() {
 #[test]
 fn usd_by_its_own_writer() {
     // tools/formats/usd_vectors.py: two prims move the Gaussians, a turn by 90 degrees about x, a scale of 2, a step.
-    let mut loaded = golden("source.usdc", Frame::Y_UP);
+    let mut loaded = golden("placed.usdz", Frame::Y_UP);
     assert!(loaded.notes.is_empty(), "{:?}", loaded.notes);
     let turn = DQuat::from_rotation_x(-std::f64::consts::FRAC_PI_2);
     loaded.splats.transform(0.5, turn, turn * DVec3::new(-0.5, -1.0, -1.5));

@@ -174,7 +174,7 @@ fn stages() {
     let usd = |bytes: &[u8]| try_all(Format::Usda, bytes).unwrap_err();
     has(&usd(b"nothing of the kind"), &["layer", "text layer"]);
     has(&usd(&[0xff, 0xfe]), &["layer", "UTF-8"]);
-    has(&usd(b"PXR-USDC and no more"), &["layer", "binary layer"]);
+    has(&usd(b"PXR-USDC and no more"), &["layer", "usdcat", "a binary one (.usdc)"]);
     has(&usd(b"PK and no more"), &["archive", ".usdz"]);
     has(&usd(b"#usda 1.0\n"), &["stage", "ParticleField3DGaussianSplat", "none"]);
     // Changes to the text of a good file.
