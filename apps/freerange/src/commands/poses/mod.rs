@@ -62,8 +62,7 @@ struct Report<'a> {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
     let photos = photos_in(&args.photos)?;
-    let names: Vec<String> =
-        in_order(&photos).iter().filter_map(|p| Some(p.file_name()?.to_string_lossy().into_owned())).collect();
+    let names: Vec<String> = in_order(&photos).iter().map(|p| plain_name(p)).collect();
     if names.len() < 4 {
         return Err(CliError::input(format!(
             "{}: expected at least 4 photos, found {}; {ADVICE}",
@@ -74,7 +73,6 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     let engine = Engine::find(args.python.as_deref())?;
     eprintln!("{} photos, {}", names.len(), engine.name());
     let output = OutputFolder::create("poses", &args.output)?;
-    let work = tempfile::tempdir().map_err(CliError::failure)?;
     for photo in &photos {
         let to = output.path(&format!("images/{}", plain_name(photo)))?;
         if to.exists() {
@@ -82,24 +80,43 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         }
         std::fs::copy(photo, to).map_err(|e| CliError::file(photo, e))?;
     }
-    let job = job(args, work.path(), &output.path("images")?, &photos, &names)?;
+    let (mut done, mut judgement) = attempt(args, &engine, &output, &photos, &names, NEIGHBORS)?;
+    if judgement.in_doubt {
+        // Photos that look alike are farther apart than those that follow one another: fewer pairs mix up fewer.
+        eprintln!("note: {}; trying again with fewer neighbors", judgement.refused.join("; "));
+        (done, judgement) = attempt(args, &engine, &output, &photos, &names, 0.5 * NEIGHBORS)?;
+    }
+    if names.len() < MANY {
+        judgement.warnings.push(format!("{} photos are few: {MANY} or more are placed more surely", names.len()));
+    }
+    finish(args, &names, &done, &judgement, output)
+}
+
+/// Runs the engine on photos and the neighbors of each, and judges what it finds.
+fn attempt(
+    args: &Args,
+    engine: &Engine,
+    output: &OutputFolder,
+    photos: &[PathBuf],
+    names: &[String],
+    neighbors: f64,
+) -> Result<(Done, Judgement), CliError> {
+    let work = tempfile::tempdir().map_err(CliError::failure)?;
+    let job = job(args, work.path(), &output.path("images")?, photos, names, neighbors)?;
     let done = engine.run(&job, &output.path("poses.log")?)?;
-    let mut judgement = Judgement::of_engine(&names, &done);
+    let mut judgement = Judgement::of_engine(names, &done);
     if judgement.refused.is_empty() {
         for name in ["cameras.bin", "images.bin", "points3D.bin"] {
             let from = work.path().join("model").join(name);
             std::fs::copy(&from, output.path(&format!("sparse/0/{name}"))?).map_err(|e| CliError::file(&from, e))?;
         }
         let found = cameras(&output.path("sparse/0/cameras.bin")?, Some(Format::Colmap), None)?;
-        judgement.look(&found, &names, args.uneven)?;
+        judgement.look(&found, names, args.uneven)?;
         if judgement.refused.is_empty() {
             judgement.look_at_photos(&found)?;
         }
     }
-    if names.len() < MANY {
-        judgement.warnings.push(format!("{} photos are few: {MANY} or more are placed more surely", names.len()));
-    }
-    finish(args, &names, &done, &judgement, output)
+    Ok((done, judgement))
 }
 
 /// Writes what was found, and says it.
@@ -141,7 +158,14 @@ fn plain_name(photo: &Path) -> String {
     photo.file_name().unwrap_or_default().to_string_lossy().replace(char::is_whitespace, "_")
 }
 
-fn job(args: &Args, work: &Path, images: &Path, photos: &[PathBuf], names: &[String]) -> Result<Job, CliError> {
+fn job(
+    args: &Args,
+    work: &Path,
+    images: &Path,
+    photos: &[PathBuf],
+    names: &[String],
+    neighbors: f64,
+) -> Result<Job, CliError> {
     // One camera for each size.
     let mut sizes: BTreeMap<(u32, u32), Vec<String>> = BTreeMap::new();
     for photo in in_order(photos) {
@@ -149,7 +173,7 @@ fn job(args: &Args, work: &Path, images: &Path, photos: &[PathBuf], names: &[Str
         sizes.entry(size).or_default().push(plain_name(&photo));
     }
     let pairs = work.join("pairs.txt");
-    std::fs::write(&pairs, ring(names)).map_err(|e| CliError::file(&pairs, e))?;
+    std::fs::write(&pairs, ring(names, neighbors)).map_err(|e| CliError::file(&pairs, e))?;
     let absolute = |p: &Path| std::fs::canonicalize(p).map_err(|e| CliError::file(p, e));
     Ok(Job {
         work: work.into(),
@@ -157,7 +181,8 @@ fn job(args: &Args, work: &Path, images: &Path, photos: &[PathBuf], names: &[Str
         names: names.to_vec(),
         groups: sizes.into_values().collect(),
         pairs,
-        thorough: names.len() < MANY,
+        thorough: names.len() < MANY || neighbors < NEIGHBORS,
+        all_pairs: neighbors >= NEIGHBORS,
         peak_threshold: if args.masks.is_some() { 0.0066 } else { 0.002 },
         masks: args.masks.as_deref().map(absolute).transpose()?,
         seed: args.seed,
@@ -165,8 +190,8 @@ fn job(args: &Args, work: &Path, images: &Path, photos: &[PathBuf], names: &[Str
 }
 
 /// Pairs of photos that are near to one another on one turn around, a line each.
-fn ring(names: &[String]) -> String {
-    let reach = ((names.len() as f64 * NEIGHBORS).round() as usize).max(2).min((names.len() - 1) / 2 + 1);
+fn ring(names: &[String], share: f64) -> String {
+    let reach = ((names.len() as f64 * share).round() as usize).max(2).min((names.len() - 1) / 2 + 1);
     let mut lines = std::collections::BTreeSet::new();
     for i in 0..names.len() {
         for k in 1..=reach {
@@ -184,12 +209,17 @@ mod tests {
     use super::*;
 
     #[test]
+    fn names_have_no_spaces() {
+        assert_eq!(plain_name(Path::new("a/IMG (1) x.jpg")), "IMG_(1)_x.jpg");
+    }
+
+    #[test]
     fn neighbors_on_a_ring_are_paired_once() {
         let names: Vec<String> = (0..24).map(|i| i.to_string()).collect();
-        let pairs = ring(&names);
+        let pairs = ring(&names, NEIGHBORS);
         assert_eq!(pairs.lines().count(), 24 * 4);
         assert!(pairs.contains("0 23\n") && pairs.contains("1 5\n") && !pairs.contains("0 5\n"));
         let few: Vec<String> = (0..4).map(|i| i.to_string()).collect();
-        assert_eq!(ring(&few).lines().count(), 6);
+        assert_eq!(ring(&few, NEIGHBORS).lines().count(), 6);
     }
 }
