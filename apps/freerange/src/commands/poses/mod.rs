@@ -41,7 +41,7 @@ pub struct Args {
     /// The photos are not at even steps once around: uneven steps are told of, not refused.
     #[arg(long)]
     uneven: bool,
-    /// A folder of masks as COLMAP has them (NAME.jpg.png, black is passed over), for objects on a turntable.
+    /// A folder of masks (NAME.jpg.png or NAME.png; black is passed over), for objects on a turntable.
     #[arg(long, value_name = "FOLDER")]
     masks: Option<PathBuf>,
     /// Seed of the engine's random numbers.
@@ -184,9 +184,42 @@ fn job(
         thorough: names.len() < MANY || neighbors < NEIGHBORS,
         all_pairs: neighbors >= NEIGHBORS,
         peak_threshold: if args.masks.is_some() { 0.0066 } else { 0.002 },
-        masks: args.masks.as_deref().map(absolute).transpose()?,
+        masks: args.masks.as_deref().map(|from| masks_again(from, photos, &work.join("masks"))).transpose()?,
         seed: args.seed,
     })
+}
+
+/// Masks as COLMAP reads them without surprises: gray, black or white, of the photo's own size, one for each photo; white where there is none.
+/// (It leaves photos without a mask out, and lays masks of another size on pixel for pixel.)
+fn masks_again(from: &Path, photos: &[PathBuf], to: &Path) -> Result<PathBuf, CliError> {
+    std::fs::create_dir_all(to).map_err(|e| CliError::file(to, e))?;
+    let mut found = 0;
+    for photo in photos {
+        let size = image::image_dimensions(photo).map_err(|e| CliError::file(photo, e))?;
+        let stem = photo.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        let whole = photo.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let names = [format!("{whole}.png"), format!("{stem}.png"), format!("{whole}.mask.png")];
+        let mask = match names.iter().map(|name| from.join(name)).find(|path| path.is_file()) {
+            None => image::GrayImage::from_pixel(size.0, size.1, image::Luma([255])),
+            Some(path) => {
+                found += 1;
+                let mut mask = image::open(&path).map_err(|e| CliError::file(&path, e))?.into_luma8();
+                if mask.dimensions() != size {
+                    let ((w, h), (mw, mh)) = (size, mask.dimensions());
+                    let what = format!("expected {w} x {h} pixels, as its photo has, found {mw} x {mh}");
+                    return Err(CliError::file(&path, what));
+                }
+                mask.pixels_mut().for_each(|p| p[0] = if p[0] >= 128 { 255 } else { 0 });
+                mask
+            }
+        };
+        let path = to.join(format!("{}.png", plain_name(photo)));
+        mask.save(&path).map_err(|e| CliError::file(&path, e))?;
+    }
+    match found {
+        0 => Err(CliError::file(from, "expected masks with the photos' names (NAME.jpg.png or NAME.png), found none")),
+        _ => Ok(to.into()),
+    }
 }
 
 /// Pairs of photos that are near to one another on one turn around, a line each.
@@ -207,6 +240,25 @@ fn ring(names: &[String], share: f64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn masks_are_written_for_every_photo() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        std::fs::create_dir(at("given")).unwrap();
+        let photos: Vec<PathBuf> = ["a b.png", "c.png"].map(at).to_vec();
+        photos.iter().for_each(|p| image::RgbImage::new(8, 6).save(p).unwrap());
+        assert!(masks_again(&at("given"), &photos, &at("none")).unwrap_err().to_string().contains("found none"));
+        let label = image::GrayImage::from_fn(8, 6, |x, _| image::Luma([if x < 4 { 20 } else { 200 }]));
+        label.save(at("given/a b.png")).unwrap();
+        let out = masks_again(&at("given"), &photos, &at("out")).unwrap();
+        let read = |name: &str| image::open(out.join(name)).unwrap().into_luma8();
+        assert_eq!((read("a_b.png.png")[(0, 0)][0], read("a_b.png.png")[(7, 5)][0]), (0, 255));
+        assert!(read("c.png.png").pixels().all(|p| p[0] == 255));
+        image::GrayImage::new(4, 6).save(at("given/c.png")).unwrap();
+        let error = masks_again(&at("given"), &photos, &at("bad")).unwrap_err().to_string();
+        assert!(error.contains("c.png") && error.contains("4 x 6"), "{error}");
+    }
 
     #[test]
     fn names_have_no_spaces() {
