@@ -3,7 +3,7 @@
 usage: poses.py CAPTURES OUT [--freerange PROGRAM] [--python PYTHON] [--scenes NAME ...]
 CAPTURES holds folders with images/ and transforms.json, as the example `tabletops` of freerange-scene writes them. Each gets OUT/NAME and a line:
 exit code, photos with a pose, those of them that are off by more than 5 degrees, the median error in degrees, seconds. The rotation between
-both frames is that of the photo under which most others agree. Needs numpy and pycolmap (to read models).
+both frames is the mean of those photos that agree with one another. Needs numpy and pycolmap (to read models).
 """
 import argparse
 import json
@@ -23,15 +23,17 @@ def angle(r):
 
 
 def errors(truth, found):
-    """Degrees by which each rotation is off, under the best common rotation of the world."""
+    """Degrees by which each rotation is off, under the common rotation of the world that most photos agree with."""
     names = sorted(found)
     best = None
     for name in names:
         turn = found[name].T @ truth[name]
-        off = [angle(found[n] @ turn @ truth[n].T) for n in names]
-        if best is None or np.median(off) < np.median(best):
-            best = off
-    return best
+        near = [n for n in names if angle(found[n] @ turn @ truth[n].T) < WRONG]
+        if best is None or len(near) > len(best):
+            best = near
+    u, _, v = np.linalg.svd(sum(found[n].T @ truth[n] for n in best))
+    turn = u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v
+    return [angle(found[n] @ turn @ truth[n].T) for n in names]
 
 
 def main():

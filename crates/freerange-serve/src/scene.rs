@@ -171,8 +171,12 @@ pub fn prepare(
     write_atomically(&scene_file(folder), |w| std::io::Write::write_all(w, &text)).map_err(Refusal::own)?;
 
     let mut understood = serde_json::to_value(&report).map_err(Refusal::own)?;
-    // The page shows sentences.
-    understood["notes"] = report.notes.iter().map(|note| note.text.as_str()).collect();
+    // The page shows sentences; where we put a client's files is nobody's business.
+    let places =
+        [upload.to_path_buf(), fs::canonicalize(upload).unwrap_or_default()].map(|p| format!("{}/", p.display()));
+    let plain = |text: &str| places.iter().fold(text.to_owned(), |text, place| text.replace(place, ""));
+    understood["notes"] = report.notes.iter().map(|note| plain(note)).collect();
+    understood["warnings"] = report.warnings.iter().map(|warning| plain(warning)).collect();
     understood["canonical_from_user"] =
         serde_json::to_value::<Similarity>(canonical.canonical_from_user).map_err(Refusal::own)?;
     for (view, told) in loaded.views.iter().zip(understood["views"].as_array_mut().into_iter().flatten()) {

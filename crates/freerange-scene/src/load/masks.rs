@@ -83,7 +83,7 @@ pub(super) fn mask_files(
         if count > 0 && !found.folders.contains(folder) && found.of.iter().all(Option::is_none) {
             notes.push(Note::warning(format!(
                 "{}: none of its {count} images has a photo's name (as in NAME.png, NAME.jpg.png, NAME.jpg.mask.png): not used as masks",
-                folder.display()
+                cameras.short(folder)
             )));
         }
     }

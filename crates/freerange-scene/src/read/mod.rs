@@ -180,6 +180,11 @@ pub struct Cameras {
 }
 
 impl Cameras {
+    /// A path for the user to read: from the scene's folder on, where it lies there.
+    pub(crate) fn short(&self, path: &Path) -> String {
+        path.strip_prefix(&self.root).unwrap_or(path).display().to_string()
+    }
+
     /// What a reader found; the rest is added by [`cameras_with`].
     fn new(format: Format, photos: Vec<Photo>, files: Vec<PathBuf>, notes: Vec<Note>) -> Self {
         let any_up = matches!(format, Format::Colmap | Format::Metashape);

@@ -51,7 +51,7 @@ impl<'a> Photos<'a> {
                     Located::Missing => {}
                     Located::There(found) => {
                         self.found += 1;
-                        self.renamed.push(format!("{} for {}", found.display(), path.display()));
+                        self.renamed.push(format!("{} for {}", tail.display(), path.display()));
                         return Ok(Some(found));
                     }
                     located => return self.take(located, &tail.to_string_lossy()),

@@ -76,7 +76,8 @@ pub fn run(file: &Path, version: &str, job: &Job, log: &Path) -> Result<Done, Cl
         ("TwoViewGeometry.filter_stationary_matches", flag(true)),
     ];
     let mut done = Done { engine: format!("COLMAP {version}"), ..Done::default() };
-    for (i, stage) in ["neighbors", "all"].into_iter().enumerate() {
+    let stages = if job.all_pairs { &["neighbors", "all"][..] } else { &["neighbors"][..] };
+    for (i, stage) in stages.iter().copied().enumerate() {
         bar.at(2 + 2 * i as u64, &format!("matches {stage}"));
         let mut options = matching.to_vec();
         if stage == "neighbors" {

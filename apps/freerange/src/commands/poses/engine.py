@@ -1,7 +1,7 @@
 """Poses of photos by pycolmap, run by `freerange poses` in a Python that has it.
 
 usage: engine.py JOB.json
-JOB: work, images (folders), names, groups (lists of names that share a camera), pairs (a file), thorough, masks (a folder or null), seed.
+JOB: work, images (folders), names, groups (lists of names that share a camera), pairs (a file), thorough, all_pairs, masks (a folder or null), seed.
 Prints a line of JSON for each step that begins; the model comes into work/model, what was done into work/result.json.
 """
 import json
@@ -40,13 +40,14 @@ def main():
     geometry = pycolmap.TwoViewGeometryOptions(filter_stationary_matches=True)
     mapper = pycolmap.IncrementalPipelineOptions(
         min_model_size=3, num_threads=1, random_seed=job["seed"], ba_use_gpu=False, extract_colors=True)
+    mapper.max_runtime_seconds = 600
     mapper.mapper.abs_pose_min_num_inliers = 15
     mapper.mapper.init_min_tri_angle = 4.0
     mapper.mapper.init_min_num_inliers = 30
     mapper.triangulation.ignore_two_view_tracks = False
 
     best, models, used = None, [], None
-    for stage in ("neighbors", "all"):
+    for stage in ("neighbors", "all") if job["all_pairs"] else ("neighbors",):
         say(step="matches", pairs=stage)
         if stage == "neighbors":
             pairs = pycolmap.ImportedPairingOptions(match_list_path=job["pairs"])

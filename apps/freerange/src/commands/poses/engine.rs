@@ -40,6 +40,8 @@ pub struct Job {
     pub pairs: PathBuf,
     /// Slower features that hold under larger turns.
     pub thorough: bool,
+    /// Whether all pairs are compared where neighbors leave photos out.
+    pub all_pairs: bool,
     /// Contrast that a feature needs at least.
     pub peak_threshold: f64,
     /// A folder of masks as COLMAP has them.

@@ -28,6 +28,9 @@ const MOST_SURPRISE: f64 = 8.0;
 pub struct Judgement {
     /// Why they are not to be used; empty where they are.
     pub refused: Vec<String>,
+    /// Refused as photos may be mixed up that look alike.
+    #[serde(skip)]
+    pub in_doubt: bool,
     /// What may be wrong.
     pub warnings: Vec<String>,
     /// Photos without a pose.
@@ -105,7 +108,10 @@ impl Judgement {
     fn ring(&mut self, placed: &[(usize, &str, Camera, Lens)], middle: DVec3, all: usize, uneven: bool) {
         let doubt = |found: &mut Self, text: String| match uneven {
             true => found.warnings.push(text),
-            false => found.refused.push(text),
+            false => {
+                found.in_doubt = true;
+                found.refused.push(text);
+            }
         };
         let next = |i: usize| (i + 1) % placed.len();
         let rotation = |i: usize| DMat3::from_mat4(placed[i].2.world_to_camera);

@@ -41,7 +41,7 @@ pub struct Args {
     /// The photos are not at even steps once around: uneven steps are told of, not refused.
     #[arg(long)]
     uneven: bool,
-    /// A folder of masks as COLMAP has them (NAME.jpg.png, black is passed over), for objects on a turntable.
+    /// A folder of masks (NAME.jpg.png or NAME.png; black is passed over), for objects on a turntable.
     #[arg(long, value_name = "FOLDER")]
     masks: Option<PathBuf>,
     /// Seed of the engine's random numbers.
@@ -62,8 +62,7 @@ struct Report<'a> {
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
     let photos = photos_in(&args.photos)?;
-    let names: Vec<String> =
-        in_order(&photos).iter().filter_map(|p| Some(p.file_name()?.to_string_lossy().into_owned())).collect();
+    let names: Vec<String> = in_order(&photos).iter().map(|p| plain_name(p)).collect();
     if names.len() < 4 {
         return Err(CliError::input(format!(
             "{}: expected at least 4 photos, found {}; {ADVICE}",
@@ -74,7 +73,6 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     let engine = Engine::find(args.python.as_deref())?;
     eprintln!("{} photos, {}", names.len(), engine.name());
     let output = OutputFolder::create("poses", &args.output)?;
-    let work = tempfile::tempdir().map_err(CliError::failure)?;
     for photo in &photos {
         let to = output.path(&format!("images/{}", plain_name(photo)))?;
         if to.exists() {
@@ -82,24 +80,43 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         }
         std::fs::copy(photo, to).map_err(|e| CliError::file(photo, e))?;
     }
-    let job = job(args, work.path(), &output.path("images")?, &photos, &names)?;
+    let (mut done, mut judgement) = attempt(args, &engine, &output, &photos, &names, NEIGHBORS)?;
+    if judgement.in_doubt {
+        // Photos that look alike are farther apart than those that follow one another: fewer pairs mix up fewer.
+        eprintln!("note: {}; trying again with fewer neighbors", judgement.refused.join("; "));
+        (done, judgement) = attempt(args, &engine, &output, &photos, &names, 0.5 * NEIGHBORS)?;
+    }
+    if names.len() < MANY {
+        judgement.warnings.push(format!("{} photos are few: {MANY} or more are placed more surely", names.len()));
+    }
+    finish(args, &names, &done, &judgement, output)
+}
+
+/// Runs the engine on photos and the neighbors of each, and judges what it finds.
+fn attempt(
+    args: &Args,
+    engine: &Engine,
+    output: &OutputFolder,
+    photos: &[PathBuf],
+    names: &[String],
+    neighbors: f64,
+) -> Result<(Done, Judgement), CliError> {
+    let work = tempfile::tempdir().map_err(CliError::failure)?;
+    let job = job(args, work.path(), &output.path("images")?, photos, names, neighbors)?;
     let done = engine.run(&job, &output.path("poses.log")?)?;
-    let mut judgement = Judgement::of_engine(&names, &done);
+    let mut judgement = Judgement::of_engine(names, &done);
     if judgement.refused.is_empty() {
         for name in ["cameras.bin", "images.bin", "points3D.bin"] {
             let from = work.path().join("model").join(name);
             std::fs::copy(&from, output.path(&format!("sparse/0/{name}"))?).map_err(|e| CliError::file(&from, e))?;
         }
         let found = cameras(&output.path("sparse/0/cameras.bin")?, Some(Format::Colmap), None)?;
-        judgement.look(&found, &names, args.uneven)?;
+        judgement.look(&found, names, args.uneven)?;
         if judgement.refused.is_empty() {
             judgement.look_at_photos(&found)?;
         }
     }
-    if names.len() < MANY {
-        judgement.warnings.push(format!("{} photos are few: {MANY} or more are placed more surely", names.len()));
-    }
-    finish(args, &names, &done, &judgement, output)
+    Ok((done, judgement))
 }
 
 /// Writes what was found, and says it.
@@ -141,7 +158,14 @@ fn plain_name(photo: &Path) -> String {
     photo.file_name().unwrap_or_default().to_string_lossy().replace(char::is_whitespace, "_")
 }
 
-fn job(args: &Args, work: &Path, images: &Path, photos: &[PathBuf], names: &[String]) -> Result<Job, CliError> {
+fn job(
+    args: &Args,
+    work: &Path,
+    images: &Path,
+    photos: &[PathBuf],
+    names: &[String],
+    neighbors: f64,
+) -> Result<Job, CliError> {
     // One camera for each size.
     let mut sizes: BTreeMap<(u32, u32), Vec<String>> = BTreeMap::new();
     for photo in in_order(photos) {
@@ -149,7 +173,7 @@ fn job(args: &Args, work: &Path, images: &Path, photos: &[PathBuf], names: &[Str
         sizes.entry(size).or_default().push(plain_name(&photo));
     }
     let pairs = work.join("pairs.txt");
-    std::fs::write(&pairs, ring(names)).map_err(|e| CliError::file(&pairs, e))?;
+    std::fs::write(&pairs, ring(names, neighbors)).map_err(|e| CliError::file(&pairs, e))?;
     let absolute = |p: &Path| std::fs::canonicalize(p).map_err(|e| CliError::file(p, e));
     Ok(Job {
         work: work.into(),
@@ -157,16 +181,50 @@ fn job(args: &Args, work: &Path, images: &Path, photos: &[PathBuf], names: &[Str
         names: names.to_vec(),
         groups: sizes.into_values().collect(),
         pairs,
-        thorough: names.len() < MANY,
+        thorough: names.len() < MANY || neighbors < NEIGHBORS,
+        all_pairs: neighbors >= NEIGHBORS,
         peak_threshold: if args.masks.is_some() { 0.0066 } else { 0.002 },
-        masks: args.masks.as_deref().map(absolute).transpose()?,
+        masks: args.masks.as_deref().map(|from| masks_again(from, photos, &work.join("masks"))).transpose()?,
         seed: args.seed,
     })
 }
 
+/// Masks as COLMAP reads them without surprises: gray, black or white, of the photo's own size, one for each photo; white where there is none.
+/// (It leaves photos without a mask out, and lays masks of another size on pixel for pixel.)
+fn masks_again(from: &Path, photos: &[PathBuf], to: &Path) -> Result<PathBuf, CliError> {
+    std::fs::create_dir_all(to).map_err(|e| CliError::file(to, e))?;
+    let mut found = 0;
+    for photo in photos {
+        let size = image::image_dimensions(photo).map_err(|e| CliError::file(photo, e))?;
+        let stem = photo.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        let whole = photo.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let names = [format!("{whole}.png"), format!("{stem}.png"), format!("{whole}.mask.png")];
+        let mask = match names.iter().map(|name| from.join(name)).find(|path| path.is_file()) {
+            None => image::GrayImage::from_pixel(size.0, size.1, image::Luma([255])),
+            Some(path) => {
+                found += 1;
+                let mut mask = image::open(&path).map_err(|e| CliError::file(&path, e))?.into_luma8();
+                if mask.dimensions() != size {
+                    let ((w, h), (mw, mh)) = (size, mask.dimensions());
+                    let what = format!("expected {w} x {h} pixels, as its photo has, found {mw} x {mh}");
+                    return Err(CliError::file(&path, what));
+                }
+                mask.pixels_mut().for_each(|p| p[0] = if p[0] >= 128 { 255 } else { 0 });
+                mask
+            }
+        };
+        let path = to.join(format!("{}.png", plain_name(photo)));
+        mask.save(&path).map_err(|e| CliError::file(&path, e))?;
+    }
+    match found {
+        0 => Err(CliError::file(from, "expected masks with the photos' names (NAME.jpg.png or NAME.png), found none")),
+        _ => Ok(to.into()),
+    }
+}
+
 /// Pairs of photos that are near to one another on one turn around, a line each.
-fn ring(names: &[String]) -> String {
-    let reach = ((names.len() as f64 * NEIGHBORS).round() as usize).max(2).min((names.len() - 1) / 2 + 1);
+fn ring(names: &[String], share: f64) -> String {
+    let reach = ((names.len() as f64 * share).round() as usize).max(2).min((names.len() - 1) / 2 + 1);
     let mut lines = std::collections::BTreeSet::new();
     for i in 0..names.len() {
         for k in 1..=reach {
@@ -184,12 +242,36 @@ mod tests {
     use super::*;
 
     #[test]
+    fn masks_are_written_for_every_photo() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        std::fs::create_dir(at("given")).unwrap();
+        let photos: Vec<PathBuf> = ["a b.png", "c.png"].map(at).to_vec();
+        photos.iter().for_each(|p| image::RgbImage::new(8, 6).save(p).unwrap());
+        assert!(masks_again(&at("given"), &photos, &at("none")).unwrap_err().to_string().contains("found none"));
+        let label = image::GrayImage::from_fn(8, 6, |x, _| image::Luma([if x < 4 { 20 } else { 200 }]));
+        label.save(at("given/a b.png")).unwrap();
+        let out = masks_again(&at("given"), &photos, &at("out")).unwrap();
+        let read = |name: &str| image::open(out.join(name)).unwrap().into_luma8();
+        assert_eq!((read("a_b.png.png")[(0, 0)][0], read("a_b.png.png")[(7, 5)][0]), (0, 255));
+        assert!(read("c.png.png").pixels().all(|p| p[0] == 255));
+        image::GrayImage::new(4, 6).save(at("given/c.png")).unwrap();
+        let error = masks_again(&at("given"), &photos, &at("bad")).unwrap_err().to_string();
+        assert!(error.contains("c.png") && error.contains("4 x 6"), "{error}");
+    }
+
+    #[test]
+    fn names_have_no_spaces() {
+        assert_eq!(plain_name(Path::new("a/IMG (1) x.jpg")), "IMG_(1)_x.jpg");
+    }
+
+    #[test]
     fn neighbors_on_a_ring_are_paired_once() {
         let names: Vec<String> = (0..24).map(|i| i.to_string()).collect();
-        let pairs = ring(&names);
+        let pairs = ring(&names, NEIGHBORS);
         assert_eq!(pairs.lines().count(), 24 * 4);
         assert!(pairs.contains("0 23\n") && pairs.contains("1 5\n") && !pairs.contains("0 5\n"));
         let few: Vec<String> = (0..4).map(|i| i.to_string()).collect();
-        assert_eq!(ring(&few).lines().count(), 6);
+        assert_eq!(ring(&few, NEIGHBORS).lines().count(), 6);
     }
 }

@@ -1,0 +1,247 @@
+//! Captures far from the origin and in small units, models for other programs, and photos without cameras: the real binary.
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    process::{Command, Output},
+};
+
+use freerange_camera::{Camera, View};
+use glam::{DMat4, DVec3};
+use image::{Rgba, RgbaImage};
+use serde_json::Value;
+
+fn freerange(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_freerange")).args(args).output().unwrap()
+}
+
+/// The bowl with its coordinates scaled and moved, as a scene.
+fn bowl(to: &Path, scale: f64, shift: [f64; 3]) {
+    let from = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/bowl");
+    let mut root: Value = serde_json::from_slice(&fs::read(from.join("transforms_train.json")).unwrap()).unwrap();
+    for frame in root["frames"].as_array_mut().unwrap() {
+        let name = format!("{}.png", frame["file_path"].as_str().unwrap());
+        fs::create_dir_all(to.join(&name).parent().unwrap()).unwrap();
+        fs::copy(from.join(&name), to.join(&name)).unwrap();
+        for (i, shift) in shift.iter().enumerate() {
+            let v = frame["transform_matrix"][i][3].as_f64().unwrap();
+            frame["transform_matrix"][i][3] = (scale * v + shift).into();
+        }
+    }
+    fs::write(to.join("transforms.json"), root.to_string()).unwrap();
+}
+
+/// Reconstructs as quickly as can be; the report, and what was said on standard error.
+fn reconstructed(scene: &Path, out: &Path, more: &[&str]) -> (Value, String) {
+    let mut args = vec!["reconstruct", scene.to_str().unwrap(), "-o", out.to_str().unwrap(), "--steps", "1"];
+    args.extend(["--refine", "0", "--ensemble", "1", "--mirror", "0", "--turn", "0"]);
+    args.extend(more);
+    let done = freerange(&args);
+    let said = String::from_utf8_lossy(&done.stderr).into_owned();
+    assert!(done.status.success(), "{said}");
+    (serde_json::from_slice(&fs::read(out.join("report.json")).unwrap()).unwrap(), said)
+}
+
+fn psnr(report: &Value) -> f64 {
+    report["samples"][0]["input_views"]["psnr"].as_f64().unwrap()
+}
+
+/// Mean difference of two pictures, in 8-bit steps.
+fn differ(a: &Path, b: &Path) -> f64 {
+    let (a, b) = (image::open(a).unwrap().into_rgb8(), image::open(b).unwrap().into_rgb8());
+    let sum: f64 = a.iter().zip(b.iter()).map(|(a, b)| f64::from(a.abs_diff(*b))).sum();
+    sum / a.len() as f64
+}
+
+#[test]
+fn place_and_units_of_a_scene_do_not_matter() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let place = [448_000.0, 5_411_000.0, 300.0];
+    bowl(&at("near"), 1.0, [0.0; 3]);
+    bowl(&at("far"), 1.0, place);
+    bowl(&at("small"), 1e-3, [0.0; 3]);
+    let (near, _) = reconstructed(&at("near"), &at("near-out"), &[]);
+    let (far, said) = reconstructed(&at("far"), &at("far-out"), &["--format", "colmap"]);
+    let (small, _) = reconstructed(&at("small"), &at("small-out"), &[]);
+    for other in [&far, &small] {
+        assert!((psnr(other) - psnr(&near)).abs() < 0.5, "{} {}", psnr(other), psnr(&near));
+    }
+    // What was subtracted is written down and told.
+    assert!(near.get("origin").is_none());
+    let origin: Vec<f64> = far["origin"].as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect();
+    assert!(origin.iter().zip(place).all(|(o, p)| (o - p).abs() <= 2.0), "{origin:?}");
+    let notes = far["notes"].as_array().unwrap();
+    assert!(
+        notes.iter().any(|n| n["kind"] == "changed" && n["text"].as_str().unwrap().contains("far from the origin"))
+    );
+    assert!(said.contains("note: the cameras lie far from the origin"), "{said}");
+    let header = fs::read(at("far-out/gaussians.ply")).unwrap();
+    assert!(
+        String::from_utf8_lossy(&header[..300])
+            .contains(&format!("comment origin {} {} {}\n", origin[0], origin[1], origin[2]))
+    );
+    // Cameras of the scene's own coordinates see the result.
+    for name in ["near", "far", "small"] {
+        let file = at(&format!("{name}-out/gaussians.ply"));
+        let (renders, cameras) = (at(&format!("{name}-renders")), at(name));
+        let done = freerange(&[
+            "render",
+            file.to_str().unwrap(),
+            "--cameras",
+            cameras.to_str().unwrap(),
+            "-o",
+            renders.to_str().unwrap(),
+        ]);
+        assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    }
+    let mut pictures: Vec<PathBuf> = fs::read_dir(at("near-renders")).unwrap().map(|e| e.unwrap().path()).collect();
+    pictures.retain(|p| p.extension().is_some_and(|e| e == "png"));
+    assert_eq!(pictures.len(), 4);
+    for picture in &pictures {
+        for other in ["far", "small"] {
+            let off = differ(picture, &at(&format!("{other}-renders")).join(picture.file_name().unwrap()));
+            assert!(off < 1.0, "{other}: {off}");
+        }
+    }
+    // Models of other programs have 64 bits.
+    let found = freerange_scene::read::cameras(&at("far-out/colmap"), None, None).unwrap();
+    assert_eq!(found.photos.len(), 4);
+    assert!((found.origin - DVec3::from_array(place)).length() < 4.0, "{}", found.origin);
+    assert!(fs::metadata(at("far-out/colmap/sparse/0/points3D.bin")).unwrap().len() > 10_000);
+}
+
+#[test]
+fn warnings_of_inspect_are_told_and_kept() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = folder.path().join("scene");
+    bowl(&scene, 1.0, [0.0; 3]);
+    let file = scene.join("transforms.json");
+    let mut root: Value = serde_json::from_slice(&fs::read(&file).unwrap()).unwrap();
+    root["frames"].as_array_mut().unwrap().truncate(3);
+    fs::write(&file, root.to_string()).unwrap();
+    let (report, said) = reconstructed(&scene, &folder.path().join("out"), &[]);
+    let warned = |n: &Value| n["kind"] == "warning" && n["text"].as_str().unwrap().contains("only 3 photos");
+    assert!(report["notes"].as_array().unwrap().iter().any(warned), "{}", report["notes"]);
+    assert!(said.contains("warning: only 3 photos"), "{said}");
+}
+
+/// A ring of photos of a striped ball, whose file is `NN.png`.
+fn ring(count: usize) -> Vec<View> {
+    (0..count)
+        .map(|i| {
+            let a = std::f64::consts::TAU * i as f64 / count as f64;
+            let eye = DVec3::new(2.0 * a.cos(), 2.0 * a.sin(), 0.9);
+            let camera = Camera::look_at(eye, DVec3::ZERO, DVec3::Z, 0.8, 96, 72);
+            let image = RgbaImage::from_fn(96, 72, |x, y| {
+                let d = camera.ray_direction(f64::from(x) + 0.5, f64::from(y) + 0.5);
+                let (b, c) = (eye.dot(d), eye.length_squared() - 0.16);
+                let root = b * b - c;
+                if root < 0.0 {
+                    return Rgba([0; 4]);
+                }
+                let p = eye + (-b - root.sqrt()) * d;
+                let v = |t: f64| (128.0 + 90.0 * t.sin()) as u8;
+                Rgba([v(9.0 * p.x), v(8.0 * p.y + 1.0), v(11.0 * p.z), 255])
+            });
+            View { name: format!("{i:02}"), camera, image }
+        })
+        .collect()
+}
+
+/// Runs `poses` with an engine that finds these cameras, of photos in `folder`.
+#[cfg(unix)]
+fn posed(folder: &Path, views: &[View], found: &[View], models: &str, more: &[&str]) -> (i32, String, Option<Value>) {
+    use std::os::unix::fs::PermissionsExt;
+    let (photos, model, out) = (folder.join("photos"), folder.join("model"), folder.join("out"));
+    for path in [&photos, &model, &out] {
+        drop(fs::remove_dir_all(path));
+    }
+    fs::create_dir_all(&photos).unwrap();
+    views.iter().for_each(|v| v.image.save(photos.join(format!("{}.png", v.name))).unwrap());
+    let point = [(DVec3::ZERO, [0; 3])];
+    freerange_scene::write_colmap(&model, found, DVec3::ZERO, &point).unwrap();
+    let engine = folder.join("python");
+    let script = format!(
+        "#!/bin/sh\nif [ \"$1\" = -c ]; then echo 0.0-test; exit 0; fi\nwork=$(dirname \"$2\")\nmkdir -p \"$work/model\"\n\
+         cp {}/sparse/0/*.bin \"$work/model/\"\necho '{{\"engine\": \"test\", \"models\": {models}, \"pairs\": \"neighbors\", \"points\": 1}}' \
+         > \"$work/result.json\"\n",
+        model.display()
+    );
+    fs::write(&engine, script).unwrap();
+    fs::set_permissions(&engine, fs::Permissions::from_mode(0o755)).unwrap();
+    let text = |p: &Path| p.to_str().unwrap().to_owned();
+    let (photos, out_text, engine) = (text(&photos), text(&out), text(&engine));
+    let mut args = vec!["poses", &photos, "-o", &out_text, "--python", &engine];
+    args.extend(more);
+    let done = freerange(&args);
+    let json = fs::read(out.join("poses.json")).ok().map(|b| serde_json::from_slice(&b).unwrap());
+    (done.status.code().unwrap(), String::from_utf8_lossy(&done.stderr).into_owned(), json)
+}
+
+#[cfg(unix)]
+#[test]
+fn poses_that_an_engine_finds_are_judged() {
+    let folder = tempfile::tempdir().unwrap();
+    let views = ring(16);
+    let at = |name: &str| folder.path().join("out").join(name);
+    // Right ones: a scene.
+    let (code, said, json) = posed(folder.path(), &views, &views, "[16]", &[]);
+    assert_eq!(code, 0, "{said}");
+    assert!(at("sparse/0/images.bin").is_file() && at("images/03.png").is_file());
+    let json = json.unwrap();
+    assert_eq!(json["judgement"]["refused"].as_array().unwrap().len(), 0);
+    assert!((json["judgement"]["turns"][0].as_f64().unwrap() - 22.0).abs() < 3.0, "{json}");
+    assert_eq!(freerange_scene::read::cameras(&folder.path().join("out"), None, None).unwrap().photos.len(), 16);
+    // Some a third of a turn off, as where a pattern repeats: no scene, and where it begins is named.
+    let mut wrong = views.clone();
+    let turn = DMat4::from_rotation_z(std::f64::consts::TAU / 3.0);
+    wrong[5..11].iter_mut().for_each(|v| v.camera.world_to_camera *= turn);
+    let (code, said, json) = posed(folder.path(), &views, &wrong, "[16]", &[]);
+    assert_eq!(code, 2, "{said}");
+    assert!(said.contains("04.png to 05.png") || said.contains("10.png to 11.png"), "{said}");
+    assert!(said.contains("16 photos or more"), "{said}");
+    assert!(json.is_some() && at("poses.log").is_file() && !at("sparse").exists() && !at("images").exists());
+    // Most of the photos left out, or some of them.
+    let (code, said, _) = posed(folder.path(), &views, &views[..11], "[11, 3]", &[]);
+    assert_eq!(code, 2);
+    assert!(said.contains("only 11 of 16 photos could be placed"), "{said}");
+    let (code, said, _) = posed(folder.path(), &views, &views[..14], "[14]", &[]);
+    assert_eq!(code, 0, "{said}");
+    assert!(said.contains("no pose was found for 14.png, 15.png"), "{said}");
+    // A focal length of no lens; photos too far apart.
+    let mut wrong = views.clone();
+    wrong.iter_mut().for_each(|v| (v.camera.fx, v.camera.fy) = (20.0, 20.0));
+    let (code, said, _) = posed(folder.path(), &views, &wrong, "[16]", &[]);
+    assert!(code == 2 && said.contains("focal length"), "{said}");
+    let few = ring(5);
+    let (code, said, _) = posed(folder.path(), &few, &few, "[5]", &[]);
+    assert!(code == 2 && said.contains("degrees apart, too far"), "{said}");
+    // Half of a turn: refused, and used where the user says so.
+    let half = views[..9].to_vec();
+    let (code, said, _) = posed(folder.path(), &half, &half, "[9]", &[]);
+    assert!(code == 2 && said.contains("--uneven"), "{said}");
+    let (code, said, _) = posed(folder.path(), &half, &half, "[9]", &["--uneven"]);
+    assert!(code == 0 && said.contains("warning"), "{said}");
+}
+
+#[test]
+fn poses_need_photos_and_an_engine() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().to_str().unwrap();
+    let said = |args: &[&str]| {
+        let done = freerange(args);
+        assert_eq!(done.status.code(), Some(2));
+        String::from_utf8_lossy(&done.stderr).into_owned()
+    };
+    let out = folder.path().join("out");
+    let out = out.to_str().unwrap();
+    assert!(said(&["poses", path, "-o", out]).contains("at least 3 photos"));
+    for view in ring(5) {
+        view.image.save(folder.path().join(format!("{}.png", view.name))).unwrap();
+    }
+    let text = said(&["poses", path, "-o", out, "--python", "/nowhere/python"]);
+    assert!(text.contains("/nowhere/python") && text.contains("pycolmap"), "{text}");
+    // `reconstruct` says what to do with photos alone.
+    assert!(said(&["reconstruct", path, "-o", out]).contains("freerange poses"));
+}
