@@ -9,6 +9,7 @@ pub mod compare;
 pub mod document;
 mod error;
 mod folder;
+mod geometry;
 pub mod html;
 pub mod memory;
 mod object;
@@ -23,6 +24,7 @@ pub mod table;
 
 pub use error::EvalError;
 pub use folder::{RunFolder, differences};
+pub use geometry::{Nearest, TrueSurface, surface_metrics};
 pub use object::{EvalObject, Inputs};
 pub use report::{Environment, FORMAT, Group, Report, Spread};
 pub use scorer::{HIGHEST_PSNR, Pair, Scorer, ScorerConfig, Scores, UsedFile, fid};
