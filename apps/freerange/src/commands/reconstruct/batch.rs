@@ -323,7 +323,8 @@ fn one(
     }
     let folder = args.output.join(&entry.name);
     let scene = args.photos.load(cameras, args.sampling.up)?;
-    let (report, _) = super::reconstruct(args, &entry.scene, scene, model, program, &folder, begin, || forget(&folder))?;
+    let (report, _) =
+        super::reconstruct(args, &entry.scene, scene, model, program, &folder, begin, || forget(&folder))?;
     let row = row(entry, &report, begin.elapsed().as_secs_f64());
     let record = Record {
         version: env!("CARGO_PKG_VERSION").into(),
