@@ -266,7 +266,9 @@ impl<'a> Parser<'a> {
                     self.next()?;
                     self.pass_over('}')?;
                 }
-                Token::Text(_) => drop(self.next()?),
+                Token::Text(_) => {
+                    self.next()?;
+                }
                 other => return Err(self.wrong("a statement", &format!("{other:?}"))),
             }
         }

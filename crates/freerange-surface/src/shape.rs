@@ -71,10 +71,8 @@ impl Shape {
         let most = areas.values().copied().fold(0.0, f64::max);
         let kept: Vec<bool> = roots.iter().map(|r| areas.get(r).is_some_and(|a| *a >= share * most)).collect();
         let mut numbers = vec![0u32; kept.len()];
-        let mut next = 0;
-        for (number, _) in numbers.iter_mut().zip(&kept).filter(|(_, kept)| **kept) {
+        for (next, (number, _)) in (0..).zip(numbers.iter_mut().zip(&kept).filter(|(_, kept)| **kept)) {
             *number = next;
-            next += 1;
         }
         let pick = |values: &[Vec3]| values.iter().zip(&kept).filter(|(_, k)| **k).map(|(v, _)| *v).collect();
         let triangles = self.triangles.iter().filter(|t| kept[t[0] as usize]);
