@@ -73,7 +73,7 @@ impl ImageFiles {
         let readable = |p: &&PathBuf| extension(p).is_some_and(|e| IMAGE_EXTENSIONS.contains(&e.as_str()));
         // An extension added, in the order in which they are tried.
         let added = |e: &&str| of(&name).find(|p| extension(p).is_some_and(|own| own == **e));
-        if let Some(found) = IMAGE_EXTENSIONS.iter().find_map(|e| added(&e)) {
+        if let Some(found) = IMAGE_EXTENSIONS.iter().find_map(added) {
             return Located::There(found.clone());
         }
         let stem = name.rsplit_once('.').map_or(name.as_str(), |(stem, _)| stem);

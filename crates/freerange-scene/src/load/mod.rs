@@ -265,13 +265,16 @@ fn look_at_masks(
         return Ok(false);
     }
     let folders: Vec<String> = masks.folders.iter().map(|f| cameras.short(f)).collect();
-    let whence = if folders.is_empty() { "the cameras' file".to_owned() } else { folders.join(", ") };
+    let whence = match folders.is_empty() {
+        true => "the cameras' file".to_owned(),
+        false => format!("the folder {}", folders.join(", ")),
+    };
     let given = matches!(config.masks, MaskSource::Files(_));
     let meaning = meaning(pictures);
     let mean = pictures.iter().map(|p| p.mask_covers.1).sum::<f64>() / pictures.len() as f64;
     if meaning == Meaning::Inverted {
         return Err(SceneError::Mask {
-            name: format!("masks of {whence}"),
+            name: format!("the masks of {whence}"),
             expected: "masks in which the object is white".into(),
             found: "masks that look inverted: white all along the border, and what is black is one thing in space; --invert-masks if black \
                     is the object"
@@ -293,7 +296,7 @@ fn look_at_masks(
             100.0 * mean
         )));
     }
-    notes.push(Note::understood(format!("masks are read from files of {whence}")));
+    notes.push(Note::understood(format!("masks are read from files, those of {whence}")));
     Ok(false)
 }
 

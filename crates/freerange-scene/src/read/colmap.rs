@@ -334,7 +334,7 @@ pub fn images_text(file: &Path, bytes: &[u8]) -> Result<Vec<ColmapImage>, SceneE
 fn are_keypoints(line: &str) -> bool {
     let words: Vec<&str> = line.split_ascii_whitespace().collect();
     let point = |p: &[&str]| p[0].parse::<f64>().is_ok() && p[1].parse::<f64>().is_ok() && p[2].parse::<i64>().is_ok();
-    words.len() % 3 == 0 && words.chunks_exact(3).all(point)
+    words.len().is_multiple_of(3) && words.chunks_exact(3).all(point)
 }
 
 /// Both files of a model in `folder`, binary before text.

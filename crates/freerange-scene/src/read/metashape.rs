@@ -163,7 +163,8 @@ fn offset(
     let axes = rotation.map_or(Ok(DMat3::IDENTITY), |n| numbers(file, place, n).map(rows))?;
     let center = shift.map_or(Ok(DVec3::ZERO), |n| numbers(file, place, n).map(DVec3::from_array))?;
     let scale = scale.map_or(Ok(1.0), |n| number(file, place, "scale", n.text()))?;
-    if !(scale > 0.0) {
+    let sound = scale > 0.0;
+    if !sound {
         return Err(In(file).field(place, "scale", "a number above 0", scale));
     }
     Ok(Some(Placed { axes, center, scale }))
