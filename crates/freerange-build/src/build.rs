@@ -294,6 +294,14 @@ pub fn render_views(item: &Item, config: &BuildConfig) -> Result<(Vec<View>, Opt
     Ok((views, sets))
 }
 
+/// The mesh of an item, in the frame of its views.
+///
+/// # Errors
+/// [`BuildError::Mesh`] for a mesh that cannot be made or loaded.
+pub fn true_mesh(item: &Item, config: &BuildConfig) -> Result<Mesh, BuildError> {
+    Ok(mesh_of(item, config)?.0)
+}
+
 /// The views that evaluation uses; `None` where there are too few.
 fn evaluation(views: &[View], config: &BuildConfig, seed: u64) -> Result<Option<ViewSets>, BuildError> {
     let selection = SelectionConfig { seed, ..config.shard.selection.clone() };

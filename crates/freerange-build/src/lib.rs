@@ -20,7 +20,7 @@ mod surface;
 mod tests;
 mod validate;
 
-pub use build::{BuildOptions, Done, Summary, build, collect, merge, render_views};
+pub use build::{BuildOptions, Done, Summary, build, collect, merge, render_views, true_mesh};
 pub use config::{BuildConfig, BuildOverrides, MakingConfig, ShardConfig};
 pub use contact_sheet::contact_sheet;
 pub use error::BuildError;

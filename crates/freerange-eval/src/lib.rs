@@ -9,6 +9,7 @@ pub mod compare;
 pub mod document;
 mod error;
 mod folder;
+mod geometry;
 pub mod html;
 pub mod memory;
 mod object;
@@ -24,6 +25,7 @@ pub mod table;
 
 pub use error::EvalError;
 pub use folder::{Features, RunFolder, differences};
+pub use geometry::{Nearest, TrueSurface, surface_metrics};
 pub use object::{EvalObject, Inputs};
 pub use report::{Environment, FORMAT, FrechetVgg, Group, Report, Spread};
 pub use scorer::{Pair, Scorer, ScorerConfig, Scores, UsedFile, fid, frechet_vgg};

@@ -1,17 +1,19 @@
 //! An object under test: its validation views, and which of the others a method is shown.
 
+use std::sync::Arc;
+
 use freerange_camera::{View, ViewSets, inputs_around, inputs_beside};
 use freerange_core::hex;
 use glam::DVec3;
 use sha2::{Digest, Sha256};
 
-use crate::{EvalError, record::ViewSet};
+use crate::{EvalError, TrueSurface, record::ViewSet};
 
 /// Restarts of k-means.
 const RESTARTS: usize = 10;
 
 /// The views of one object and their roles.
-#[derive(Clone, Debug)]
+#[derive(Clone)]
 pub struct EvalObject {
     name: String,
     views: Vec<View>,
@@ -21,6 +23,7 @@ pub struct EvalObject {
     /// What inputs are chosen from where a set of that size is not given: no validation view, no place twice.
     candidates: Vec<usize>,
     seed: u64,
+    surface: Option<Arc<TrueSurface>>,
 }
 
 /// Inputs, or why there are none.
@@ -63,7 +66,7 @@ impl EvalObject {
             }
         }
         candidates.sort_unstable();
-        Ok(Self { name: name.into(), views, full, partial, validation, candidates, seed })
+        Ok(Self { name: name.into(), views, full, partial, validation, candidates, seed, surface: None })
     }
 
     /// An object from posed-image files: the views of each role, and further ones that may become inputs.
@@ -86,6 +89,17 @@ impl EvalObject {
         let (full, partial, validation) = (add(full), add(partial), add(validation));
         add(further);
         Self::from_sets(name, views, &ViewSets { labels: Vec::new(), full, partial, validation }, 0)
+    }
+
+    /// The same object with its true surface, in the frame of its cameras.
+    #[must_use]
+    pub fn with_surface(self, surface: TrueSurface) -> Self {
+        Self { surface: Some(Arc::new(surface)), ..self }
+    }
+
+    /// Its true surface, where that is known.
+    pub fn surface(&self) -> Option<&TrueSurface> {
+        self.surface.as_deref()
     }
 
     /// What it is called.

@@ -15,7 +15,7 @@ use crate::{
     memory::{peak_memory, reset_peak_memory},
     record::{Case, Measured, Outcome, Record, SampleScores, VggFeatures, ViewScores, ViewSet, means, style},
     statistics::deviation,
-    strip,
+    strip, surface_metrics,
 };
 
 /// The colour behind the object in everything that is measured or shown.
@@ -224,8 +224,12 @@ fn score(found: &Reconstructed, object: &EvalObject, inputs: &[View], shared: &S
         (Pictures::None, _) | (_, None) => None,
         (_, Some(first)) => Some(strip(inputs, &validation, first)?),
     };
+    let mut metrics = means(&samples);
+    if let (Some(truth), Some((_, cloud))) = (object.surface(), found.clouds.first()) {
+        metrics.extend(surface_metrics(cloud, truth, inputs, &validation)?);
+    }
     let measured = Measured {
-        metrics: means(&samples),
+        metrics,
         seconds: 0.0,
         peak_memory_bytes: None,
         disagreement: disagreement(&renders),

@@ -12,6 +12,7 @@
 //! * `rasterize` (feature `op`): the differentiable operation on tensors, many objects and views in one call; with the
 //!   feature `gpu` and one that says how to reach the device (`cuda`, `metal`, `vulkan`, `webgpu`), also on GPUs.
 //! * [`render`], [`render_backward`]: the same on plain slices, without a tensor library.
+//! * [`surface_depth`]: where the surface is that Gaussians show.
 //! * [`mod@reference`]: slow, in f64, for tests.
 
 #[cfg(test)]
@@ -28,7 +29,7 @@ mod op;
 pub mod reference;
 
 pub use config::RasterConfig;
-pub use cpu::{Gradients, RenderOutput, render, render_backward};
+pub use cpu::{Gradients, RenderOutput, render, render_backward, surface_depth};
 pub use error::RasterError;
 pub use mip::{MIP_BLUR, mip_compensated};
 #[cfg(feature = "op")]

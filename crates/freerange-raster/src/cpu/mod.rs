@@ -7,7 +7,10 @@
 mod bin;
 mod math;
 pub(crate) mod project;
+mod surface;
 mod tile;
+
+pub use surface::surface_depth;
 
 use crate::{CHANNELS, RasterConfig, RasterError};
 use bin::{BAND, Lists};

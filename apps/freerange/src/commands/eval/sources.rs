@@ -5,10 +5,11 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use freerange_build::{BuildConfig, Item, Items, render_views};
+use freerange_build::{BuildConfig, Item, Items, render_views, true_mesh};
 use freerange_camera::{Scene, View};
 use freerange_data::{ObjectSource, Shards, Split, Store};
-use freerange_eval::{EvalObject, runner::Objects};
+use freerange_eval::{EvalObject, TrueSurface, runner::Objects};
+use freerange_mesh::{LoadLimits, load_mesh};
 use serde_json::{Value, json};
 
 use crate::{
@@ -37,6 +38,9 @@ pub struct SourceArgs {
     /// File with the validation views, within each scene folder.
     #[arg(long, value_name = "FILE", default_value = "transforms_val.json")]
     validation_file: String,
+    /// True meshes of the scenes, NAME.glb for each scene folder: adds the distance from the result's surface to them.
+    #[arg(long, value_name = "DIR", requires = "scenes")]
+    meshes: Option<PathBuf>,
     /// Part of the shards' objects.
     #[arg(long, value_enum, default_value = "test")]
     split: SplitName,
@@ -70,7 +74,7 @@ pub struct Source {
 }
 
 enum Kind {
-    Scenes { folders: Vec<PathBuf>, files: [String; 3] },
+    Scenes { folders: Vec<PathBuf>, files: [String; 3], meshes: Option<PathBuf> },
     Shards(Box<Shards>),
     Generated { items: Vec<Item>, config: Box<BuildConfig> },
 }
@@ -147,8 +151,11 @@ impl SourceArgs {
             p.file_name().or(whole.file_name()).map_or_else(|| "scene".into(), |n| n.to_string_lossy().into_owned())
         };
         let names = folders.iter().map(name).collect();
-        let settings = json!({ "kind": "scenes", "folder": folder, "full": files[0], "partial": files[1], "validation": files[2] });
-        Ok((Kind::Scenes { folders, files }, names, settings))
+        let mut settings = json!({ "kind": "scenes", "folder": folder, "full": files[0], "partial": files[1], "validation": files[2] });
+        if let Some(meshes) = &self.meshes {
+            settings["meshes"] = json!(meshes);
+        }
+        Ok((Kind::Scenes { folders, files, meshes: self.meshes.clone() }, names, settings))
     }
 }
 
@@ -171,7 +178,12 @@ impl Source {
     fn object(&self, index: usize) -> Result<EvalObject, CliError> {
         let name = &self.names[index];
         match &self.kind {
-            Kind::Scenes { folders, files } => load_scene(name, &folders[index], files),
+            Kind::Scenes { folders, files, meshes } => {
+                let object = load_scene(name, &folders[index], files)?;
+                let Some(meshes) = meshes else { return Ok(object) };
+                let mesh = load_mesh(&meshes.join(format!("{name}.glb")), &LoadLimits::default())?.mesh;
+                Ok(object.with_surface(TrueSurface::new(&mesh)))
+            }
             Kind::Shards(shards) => {
                 let metadata = shards.metadata(index as u64)?;
                 let views = shards.object(index as u64)?.views;
@@ -181,7 +193,8 @@ impl Source {
             Kind::Generated { items, config } => {
                 let (views, sets) = render_views(&items[index], config)?;
                 let sets = sets.ok_or_else(|| no_sets(name, views.len()))?;
-                Ok(EvalObject::from_sets(name, views, &sets, items[index].seed.unwrap_or(0))?)
+                let object = EvalObject::from_sets(name, views, &sets, items[index].seed.unwrap_or(0))?;
+                Ok(object.with_surface(TrueSurface::new(&true_mesh(&items[index], config)?)))
             }
         }
     }
