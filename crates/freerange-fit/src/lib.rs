@@ -24,12 +24,13 @@ mod quality;
 mod quick;
 mod refine;
 mod search;
+mod surface;
 #[cfg(test)]
 mod tests;
 mod views;
 
 pub use axis::{Axis, FoundAxis, axis_steps, find_axis, turned};
-pub use config::{Background, FitConfig, HoldConfig, Rates, RefineConfig};
+pub use config::{Background, FitConfig, HoldConfig, LayerConfig, Rates, RefineConfig};
 pub use error::FitError;
 pub use fit::fit;
 pub use frame::frame_of;

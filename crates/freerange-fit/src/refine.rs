@@ -1,13 +1,15 @@
 //! 3DGS-MCMC that goes on from a cloud that is already good: what a generated sample needs to agree with the photos.
 
 use crate::{
-    Evidence, FitError, FitProgress, RefineConfig,
+    Evidence, FitConfig, FitError, FitProgress, HoldConfig, Rates, RefineConfig,
     fit::{checked, next_views, optimise},
     hold::Hold,
     mcmc::split,
     objective::Objective,
+    surface::{Layer, Surface, look, sweep},
     views::Targets,
 };
+use freerange_camera::View;
 use freerange_splat::Cloud;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -15,6 +17,8 @@ use std::ops::ControlFlow;
 
 /// Longest side, in pixels, of outlines. They come from guesses, which nobody vouches for to the pixel.
 const OUTLINES: u32 = 128;
+/// How much renders of the cloud before count where the layer is, of where it is not.
+const HELD_LAYER: f32 = 0.05;
 
 /// Improves a cloud's agreement with posed views, and shows more detail by more Gaussians.
 ///
@@ -34,10 +38,11 @@ pub fn refine<'a>(
     others: &[Cloud],
     seen: impl Into<Evidence<'a>>,
     config: &RefineConfig,
-    progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
+    mut progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Cloud, FitError> {
     config.check()?;
     let seen = seen.into();
+    let photos = seen.views;
     let targets = Targets::new(seen.views, config.render_size)?;
     let first = (config.coarse * config.steps as f64) as usize;
     let coarse = (first > 0).then(|| Targets::new(seen.views, Some(config.coarse_size))).transpose()?;
@@ -69,7 +74,59 @@ pub fn refine<'a>(
         Ok(outlined?.into_iter().chain(held?).collect())
     };
     let of_step = |step| coarse.as_ref().filter(|_| step < first).unwrap_or(&targets);
-    optimise(start, of_step, &fit, &mut rng, more, progress)
+    let mut stopped = false;
+    let told = |p: &FitProgress<'_>| {
+        let flow = progress(p);
+        stopped |= flow.is_break();
+        flow
+    };
+    let cloud = optimise(start, &Layer::default(), of_step, &fit, &mut rng, more, told)?;
+    if stopped || config.layer.steps == 0 {
+        return Ok(cloud);
+    }
+    let surface = Surface::of(&cloud, photos, config.hold.radius, config.layer.points)?;
+    relayer(&cloud, &surface, photos, config, progress)
+}
+
+/// Puts one opaque layer of Gaussians on `surface` where photos see it, in place of those of `cloud` that are near, and optimizes what the layer shows on
+/// the photos, held at renders of `cloud` elsewhere. `progress` hears of these steps as of a fit of their own.
+pub(crate) fn relayer(
+    cloud: &Cloud,
+    surface: &Surface,
+    photos: &[View],
+    config: &RefineConfig,
+    progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
+) -> Result<Cloud, FitError> {
+    let layer = &config.layer;
+    let mut seen = look(&surface.points, surface.spacing, photos)?;
+    if layer.sweep > 0.0 {
+        let points: Vec<_> = sweep(&seen, surface.spacing, layer.sweep, photos).iter().map(|s| s.point).collect();
+        seen = look(&points, surface.spacing, photos)?;
+    }
+    let (start, on) = Layer::on(cloud, &seen, surface.spacing, layer);
+    let weight = HoldConfig { weight: layer.hold, ..config.hold.clone() };
+    let mut hold = Hold::new(std::slice::from_ref(cloud), &weight)?;
+    hold.beside(&start, on.len(), HELD_LAYER)?;
+    let fit = FitConfig {
+        iterations: layer.steps,
+        growth_start: usize::MAX,
+        rates: Rates { mean: layer.mean_rate, ..config.rates },
+        opacity_regularizer: 0.0,
+        scale_regularizer: 0.0,
+        noise_lr: 0.0,
+        ..config.fit(start.len())
+    };
+    fit.check()?;
+    let targets = Targets::new(photos, config.render_size)?;
+    let mut rng = ChaCha8Rng::seed_from_u64(config.seed);
+    let mut hold_rng = ChaCha8Rng::seed_from_u64(config.seed);
+    hold_rng.set_stream(1);
+    let mut queue = Vec::new();
+    let more = |cloud: &Cloud, background| {
+        let held = next_views(&mut queue, hold.views(), 1, &mut hold_rng);
+        Ok(held.first().map(|&view| hold.objective(cloud, view, background)).transpose()?.into_iter().collect())
+    };
+    optimise(start, &on, |_| &targets, &fit, &mut rng, more, progress)
 }
 
 /// As many of `clouds` as `most` Gaussians allow, but the first in any case, in one place. Each Gaussian becomes what relocation
