@@ -5,7 +5,7 @@
 //! * [`find_mirror`]: the plane about which an object is its own mirror image, and [`mirrored`] photos of it.
 //! * [`find_axis`]: the axis about which it may be turned and keeps its outlines, and [`turned`] ones.
 //! * [`psnr_over_white`]: how well Gaussians show what views show.
-//! * [`refine`]: the same from a cloud that is already good, held where no view looks.
+//! * [`refine`]: the same from a cloud that is already good, held where no view looks; [`refine_on_surface`]: a study of its last part.
 //!
 //! Plain Rust over the rasteriser's CPU functions; no tensor library.
 
@@ -37,7 +37,7 @@ pub use frame::frame_of;
 pub use mirror::{FoundMirror, Mirror, find_mirror, mirror_steps, mirrored};
 pub use quality::{over_white, psnr_over_white, render_over_white};
 pub use quick::{QuickFitConfig, polish, quick_fit, tree_slice};
-pub use refine::refine;
+pub use refine::{refine, refine_on_surface};
 pub use views::{Evidence, Outline};
 
 use freerange_splat::Cloud;

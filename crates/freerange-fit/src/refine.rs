@@ -10,7 +10,9 @@ use crate::{
     views::Targets,
 };
 use freerange_camera::View;
+use freerange_core::Invalid;
 use freerange_splat::Cloud;
+use glam::DVec3;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use std::ops::ControlFlow;
@@ -88,9 +90,30 @@ pub fn refine<'a>(
     relayer(&cloud, &surface, photos, config, progress)
 }
 
+/// The layer of [`LayerConfig`](crate::LayerConfig), which [`refine`] puts on the surface that it finds, on a known one instead: `distance` is a point's
+/// distance from it, negative inside, in the frame of the photos. It is for studies of what a better surface could bring.
+///
+/// # Errors
+/// As [`refine`]; also if the configuration has no layer.
+pub fn refine_on_surface(
+    cloud: &Cloud,
+    distance: impl Fn(DVec3) -> f64 + Sync,
+    photos: &[View],
+    config: &RefineConfig,
+    progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
+) -> Result<Cloud, FitError> {
+    config.check()?;
+    let cloud = checked(cloud, usize::MAX)?;
+    if config.layer.steps == 0 {
+        return Err(Invalid::new("layer.steps", "at least 1", 0).into());
+    }
+    let surface = Surface::at(distance, config.hold.radius, config.layer.points);
+    relayer(&cloud, &surface, photos, config, progress)
+}
+
 /// Puts one opaque layer of Gaussians on `surface` where photos see it, in place of those of `cloud` that are near, and optimizes what the layer shows on
 /// the photos, held at renders of `cloud` elsewhere. `progress` hears of these steps as of a fit of their own.
-pub(crate) fn relayer(
+fn relayer(
     cloud: &Cloud,
     surface: &Surface,
     photos: &[View],

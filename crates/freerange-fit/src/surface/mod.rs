@@ -30,6 +30,7 @@ use crate::{FitError, hold::around};
 use freerange_camera::{Camera, View};
 use freerange_raster::RasterConfig;
 use freerange_splat::Cloud;
+use glam::DVec3;
 
 /// Depth maps, and their width and height in pixels.
 const MAPS: (usize, u32) = (32, 192);
@@ -54,11 +55,16 @@ impl Surface {
         let map = |camera: Camera| DepthMap::of_cloud(cloud, camera, &raster);
         let maps = around(MAPS.0, MAPS.1, radius).map(map).collect::<Result<Vec<_>, _>>()?;
         let outlines: Vec<_> = photos.iter().map(DepthMap::outline).collect();
-        let field = Field::fuse(&maps, &outlines, radius, SIDE);
-        let (mut points, spacing) = field.points(count);
+        let (mut points, spacing) = Field::fuse(&maps, &outlines, radius, SIDE).points(count);
         for _ in 0..SMOOTHING.0 {
             points = smooth(&points, SMOOTHING.1 * spacing);
         }
         Ok(Self { points, spacing })
+    }
+
+    /// About `count` points of a surface from which any point has a known distance, negative inside.
+    pub fn at(distance: impl Fn(DVec3) -> f64 + Sync, radius: f64, count: usize) -> Self {
+        let (points, spacing) = Field::new(radius, SIDE, distance).points(count);
+        Self { points, spacing }
     }
 }

@@ -1,12 +1,13 @@
 //! Surfaces of which the truth is a formula.
 
 use super::{Field, Layer, Point, Surface, discs, look, smooth, sweep};
-use crate::LayerConfig;
+use crate::{FitProgress, LayerConfig, RefineConfig, psnr_over_white, refine_on_surface};
 use freerange_camera::{Camera, View};
 use freerange_raster::{RasterConfig, render};
 use freerange_splat::{Cloud, channel};
 use glam::{DVec2, DVec3};
 use image::{Rgba, RgbaImage};
+use std::ops::ControlFlow;
 
 type Shape = fn(DVec3) -> f64;
 
@@ -243,4 +244,36 @@ fn a_layer_keeps_to_its_surface() {
         assert_eq!(cloud.row(i)[11], before[11] + 0.01);
     }
     assert_eq!(cloud.row(layer.len())[3], -3.99, "others are free");
+}
+
+/// On a known surface, from Gaussians that lie too deep: they come to lie on it, and show what the photos show.
+#[test]
+fn a_layer_on_a_known_surface_shows_what_photos_show() {
+    let (points, spacing) = Field::new(0.5, 64, sphere).points(4000);
+    let mut truth = discs(&points, spacing);
+    truth.iter_mut().for_each(|row| {
+        let color = [0.5 + row[0], 0.5 + row[1], 0.5 + row[2]];
+        row[channel::COLOR].copy_from_slice(&color);
+    });
+    let eyes = [DVec3::X, DVec3::NEG_X, DVec3::Y, DVec3::NEG_Y];
+    let photos = eyes.map(|eye| photo(&truth, view(1.5 * eye, 96)));
+    let mut deep = truth.clone();
+    deep.iter_mut().for_each(|row| row[channel::MEAN].iter_mut().for_each(|v| *v *= 0.95));
+    let layer = LayerConfig { steps: 20, points: 4000, ..LayerConfig::default() };
+    let config = RefineConfig { layer, ..RefineConfig::default() };
+    let mut steps = 0;
+    let told = |p: &FitProgress<'_>| {
+        steps = p.steps;
+        ControlFlow::Continue(())
+    };
+    let found = refine_on_surface(&deep, sphere, &photos, &config, told).unwrap();
+    assert_eq!(steps, 20);
+    let (before, after) = (psnr_over_white(&deep, &photos).unwrap(), psnr_over_white(&found, &photos).unwrap());
+    assert!(after > before + 3.0 && after > 27.0, "{before} {after}");
+    let off = (0..found.len()).filter(|&i| sphere(found.mean(i)).abs() > 0.002).count();
+    assert!(10 * off < found.len(), "{off} of {}", found.len());
+    // Nothing without steps; the same bytes again.
+    let none = refine_on_surface(&deep, sphere, &photos, &RefineConfig::default(), |_| ControlFlow::Continue(()));
+    assert!(none.unwrap_err().to_string().contains("layer.steps"));
+    assert_eq!(refine_on_surface(&deep, sphere, &photos, &config, |_| ControlFlow::Continue(())).unwrap(), found);
 }
