@@ -19,7 +19,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     };
     let number = |i: usize, default: usize| numbers.get(i).map_or(Ok(default), |n| n.parse());
     let layer = LayerConfig { steps: number(0, 80)?, points: number(1, 40_000)?, ..LayerConfig::default() };
-    let cloud = read_ply(Path::new(result))?.cloud;
+    let cloud = read_ply(Path::new(result))?.splats.cloud;
     let photos = Scene::load(Path::new(scene))?.inputs;
     let surface = TrueSurface::new(&load_mesh(Path::new(mesh), &LoadLimits::default())?.mesh);
     let longest = photos.iter().map(|v| v.image.width().max(v.image.height())).max().unwrap_or(0);
