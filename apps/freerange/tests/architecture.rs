@@ -73,7 +73,14 @@ const ROOMS: &[(&str, &[&str])] = &[
     ),
     (
         "freerange-eval",
-        &["freerange-core", "freerange-splat", "freerange-camera", "freerange-raster", "freerange-metrics"],
+        &[
+            "freerange-core",
+            "freerange-splat",
+            "freerange-camera",
+            "freerange-raster",
+            "freerange-metrics",
+            "freerange-mesh", // the true surface
+        ],
     ),
     ("freerange-cli", &["*"]),
     (

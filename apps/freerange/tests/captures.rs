@@ -79,7 +79,7 @@ fn place_and_units_of_a_scene_do_not_matter() {
     let header = fs::read(at("far-out/gaussians.ply")).unwrap();
     assert!(
         String::from_utf8_lossy(&header[..300])
-            .contains(&format!("comment origin {} {} {}\n", origin[0], origin[1], origin[2]))
+            .contains(&format!("comment Origin: {} {} {}\n", origin[0], origin[1], origin[2]))
     );
     // Cameras of the scene's own coordinates see the result.
     for name in ["near", "far", "small"] {

@@ -164,11 +164,24 @@ fn no_detail_and_too_much() {
 }
 
 #[test]
-fn missing_image() {
+fn missing_images() {
     let s = scene();
-    let first = fs::read_dir(s.path().join("train")).unwrap().next().unwrap().unwrap().path();
-    fs::remove_file(&first).unwrap();
-    refused(s.path(), &[], &["transforms_train.json", first.file_stem().unwrap().to_str().unwrap()]);
+    let mut photos: Vec<PathBuf> =
+        fs::read_dir(s.path().join("train")).unwrap().map(|entry| entry.unwrap().path()).collect();
+    photos.sort();
+    fs::remove_file(&photos[0]).unwrap();
+    // One is left out, and said to be.
+    let output = s.path().join("out");
+    let (scene, output) = (s.path().to_str().unwrap(), output.to_str().unwrap());
+    let quick = ["--steps", "1", "--refine", "0", "--mirror", "0", "--turn", "0"];
+    let done = freerange(&[&["reconstruct", scene, "-o", output][..], &quick].concat());
+    let message = String::from_utf8_lossy(&done.stderr).into_owned();
+    assert_eq!(done.status.code(), Some(0), "{message}");
+    let name = photos[0].file_stem().unwrap().to_str().unwrap();
+    assert!(message.contains("1 of 4 photos") && message.contains(name), "{message}");
+    // Of one photo alone nothing can be made.
+    photos[1..3].iter().for_each(|photo| fs::remove_file(photo).unwrap());
+    refused(s.path(), &[], &["transforms_train.json"]);
 }
 
 #[test]
