@@ -360,9 +360,10 @@ mod tests {
 
     #[test]
     fn codes_are_the_best_there_are() {
-        // Lloyd's iteration from many beginnings finds nothing better; dense in the middle, with far strays.
+        // Of no more different values than are looked at one by one. Lloyd's iteration from several beginnings finds
+        // nothing better; dense in the middle, with far strays.
         let values: Vec<f64> =
-            (0..6000).map(|i| ((f64::from(i) + 0.5) / 3000.0 - 1.0).powi(7) * 5.0 + f64::from(i % 7) * 1e-3).collect();
+            (0..4000).map(|i| ((f64::from(i) + 0.5) / 2000.0 - 1.0).powi(7) * 5.0 + f64::from(i % 7) * 1e-3).collect();
         let error = |codes: &[f32]| {
             values.iter().map(|v| (f64::from(codes[usize::from(nearest(codes, *v))]) - v).powi(2)).sum::<f64>()
         };
@@ -373,7 +374,7 @@ mod tests {
         for start in 0..3 {
             let at = |k: usize| match start {
                 0 => sorted[(2 * k + 1) * sorted.len() / (2 * CODES)],
-                1 => sorted[0] + (sorted[5999] - sorted[0]) * (k as f64 + 0.5) / CODES as f64,
+                1 => sorted[0] + (sorted[3999] - sorted[0]) * (k as f64 + 0.5) / CODES as f64,
                 _ => f64::from(codes[k]),
             };
             let mut lloyd: Vec<f32> = (0..CODES).map(|k| at(k) as f32).collect();
