@@ -11,7 +11,7 @@ fuzz_target!(|data: &[u8]| {
     match kind {
         b'm' => {
             if let Ok(manifest) = Manifest::from_json(Path::new("manifest.json"), bytes) {
-                let depths = manifest.plan.config.depths.clone();
+                let depths = manifest.plan.config.depths();
                 depths.iter().for_each(|&d| drop(manifest.statistics(d)));
                 assert!(manifest.objects().all(|o| o.bytes > 0));
             }
