@@ -11,7 +11,7 @@ use crate::{Shape, SurfaceError, iso_surface};
 /// Settings of [`mesh_of`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MeshConfig {
-    /// Voxels along the longest side of the object, 8 to [`MOST_VOXELS`].
+    /// Voxels along the longest side of the object, 8 to 512.
     pub voxels: usize,
     /// Cameras around the object.
     pub views: usize,

@@ -22,7 +22,7 @@ pub(super) fn plain(view: &View) -> Result<RgbaImage, SceneError> {
     })
 }
 
-/// Cuts the object out of views that are in memory, as [`load`] does by default: those with transparency keep it, a plain background is
+/// Cuts the object out of views that are in memory, as [`load`](super::load) does by default: those with transparency keep it, a plain background is
 /// cut away; where neither is there, poses and colors tell. Returns what was done, for the user to read.
 pub fn cut(views: &mut [View], hints: &Hints) -> Result<Vec<Note>, SceneError> {
     let told: Vec<Told> = views.iter().map(|v| Told { mask: None, alpha: !opaque(&v.image) }).collect();
