@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use freerange::{Cloud, FrameConfig, View, others_show};
-use freerange_formats::{Frame, WriteOptions};
+use freerange::{Cloud, FrameConfig, View, others_show, write_ply};
+use freerange_formats::{Format as FileFormat, Frame, WriteOptions};
 use freerange_scene::{
     LoadConfig, Loaded, MaskSource, Note,
     estimate::Hints,
@@ -127,7 +127,12 @@ fn frame(up: [f64; 3]) -> PyResult<Frame> {
 pub fn write_gaussians(py: Python<'_>, rows: PyBackedBytes, path: PathBuf, up: [f64; 3]) -> PyResult<Vec<String>> {
     let cloud = cloud(&rows)?;
     let options = WriteOptions { frame: frame(up)?, ..WriteOptions::default() };
-    py.detach(|| freerange_formats::write(&cloud.into(), &path, &options)).map_err(of_format)
+    py.detach(|| match FileFormat::of(&path)? {
+        // The bytes that `freerange reconstruct` writes.
+        FileFormat::Ply => Ok(write_ply(&cloud, &path).map(|()| Vec::new())?),
+        _ => freerange_formats::write(&cloud.into(), &path, &options),
+    })
+    .map_err(of_format)
 }
 
 /// Reads Gaussians from a file; those that fix their frame are turned into the one in which `up` is up.
