@@ -20,7 +20,7 @@ shift 2
 cd "$(dirname "$0")/.."
 rows=("$@")
 [ ${#rows[@]} -gt 0 ] || rows=(full full_seed2 no_flow_matching no_rendering no_curriculum no_patching_half no_patching
-  random_patches no_gradient_channels pixel_aligned voxel_aligned tree_coupling)
+  random_patches no_gradient_channels pixel_aligned voxel_aligned tree_coupling pipeline)
 objects=${OBJECTS:-3072} generated=${GENERATED:-100} steps=${STEPS:-} # smaller ones try the script
 shared=${FREERANGE_SHARED:-../shared}
 
@@ -33,7 +33,7 @@ echo "== objects"
 "$binary" data generate --objects "$objects" --first-seed 41000000 --gaussians fit --depths 7,8,9,10 \
   -o "$place/shards/tables" --config configs/tables/full.toml
 
-# evaluate CHECKPOINT FOLDER SOURCE OPTION...: SOURCE is a number of generated objects, or `objects`, the 21.
+# evaluate CHECKPOINT FOLDER SOURCE OPTION...: without CHECKPOINT the shipped pipeline. SOURCE is a number of generated objects, or `objects`, the 21.
 evaluate() {
   local checkpoint=$1 folder=$2 source=$3 from
   shift 3
@@ -47,16 +47,21 @@ evaluate() {
     from=(--generated "$source" --generated-size 256 -o "$folder/generated")
   fi
   [ -z "${WEIGHTS:-}" ] || from+=(--weights "$WEIGHTS")
-  "$binary" eval --checkpoint "$checkpoint" --pictures none "${from[@]}" "$@"
+  [ -z "$checkpoint" ] || from+=(--checkpoint "$checkpoint")
+  "$binary" eval --pictures none "${from[@]}" "$@"
 }
 
 for row in "${rows[@]}"; do
   echo "== $row"
   run=$place/runs/$row out=$place/rows/$row checkpoint=$place/runs/$row/checkpoint.safetensors
-  "$binary" train "$place/configs/tables/$row.toml" -o "$run" --save-every 250
   mkdir -p "$out"
-  cp "$run/log.jsonl" "$out/"
-  "$binary" model info "$checkpoint" --json >"$out/model.json"
+  if [ "$row" = pipeline ]; then
+    checkpoint=
+  else
+    "$binary" train "$place/configs/tables/$row.toml" -o "$run" --save-every 250
+    cp "$run/log.jsonl" "$out/"
+    "$binary" model info "$checkpoint" --json >"$out/model.json"
+  fi
   metrics=psnr,ssim,lpips-alex
   case $row in full | no_flow_matching | pixel_aligned | voxel_aligned) metrics+=,lpips-vgg,frechet-vgg ;; esac
   for source in "$generated" objects; do
