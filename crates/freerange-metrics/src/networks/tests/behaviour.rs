@@ -149,7 +149,7 @@ fn evaluator_computes_what_it_can_and_says_what_it_cannot() {
     assert_eq!(evaluator.metrics(), [Metric::Psnr, Metric::Ssim, Metric::SsimCropped, Metric::SsimSample]);
     assert!(evaluator.used_files().is_empty());
     let reasons: Vec<&str> = missing.iter().map(|m| m.reason.as_str()).collect();
-    assert_eq!(missing.len(), 6);
+    assert_eq!(missing.len(), 7, "{missing:?}");
     assert!(
         reasons[0].contains("alexnet-owt-7be5be79.pth") && reasons[0].contains("freerange weights fetch lpips-alex")
     );
