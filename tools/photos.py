@@ -81,7 +81,7 @@ def main():
         truth, val = scene / "truth/masks", scene / "transforms_val.json"
         for name, more in (("true", ["--masks", truth]), ("automatic", [])):
             if not (out / name / "report.json").exists():
-                run("reconstruct", scene, "-o", out / name, "--validate", val, *more)
+                run("reconstruct", scene, "-o", out / name, "--eval-scene", val, *more)
         if not (out / "inspect/inspect.json").exists():
             run("inspect", scene, "-o", out / "inspect")
         # The fit takes transforms.json: the photos without their lens, cut out by the true masks.

@@ -71,8 +71,8 @@ for row in "${rows[@]}"; do
     # Of test time, on fewer objects: differences are paired.
     half=$(((generated + 1) / 2))
     for source in "$half" objects; do
-      evaluate "$checkpoint" "$out/no-cfg" "$source" --metrics psnr,ssim --cfg-scale 1
-      evaluate "$checkpoint" "$out/no-photometric" "$source" --metrics psnr,ssim --lambda-pg 0
+      evaluate "$checkpoint" "$out/no-cfg" "$source" --metrics psnr,ssim --set propose.flow.cfg_scale=1
+      evaluate "$checkpoint" "$out/no-photometric" "$source" --metrics psnr,ssim --set propose.flow.lambda_pg=0
     done
     for inputs in 2 6 9; do # the 21 have at most seven views to choose from
       evaluate "$checkpoint" "$out/inputs-$inputs" "$half" --metrics psnr,ssim --views full --inputs "$inputs"

@@ -37,9 +37,9 @@ def main() -> None:
         rr.log("stage", rr.TextLog(f"{step.stage} {step.done} of {step.total}"))
         if step.loss is not None:
             rr.log(f"loss/{step.stage}", rr.Scalars(step.loss))
-        # Fits and refinements take hundreds of steps that differ little.
-        if step.gaussians and (step.stage == "sample" or step.done % 10 == 0):
-            g = step.gaussians[0]
+        # Fits and the optimization take hundreds of steps that differ little.
+        if step.gaussians is not None and (step.stage == "refine" or step.done % 10 == 0):
+            g = step.gaussians
             quats = g.quats[:, [1, 2, 3, 0]]  # Rerun's order is x y z w
             colors = np.column_stack([np.clip(g.colors, 0.0, 1.0), g.opacities])
             ellipsoids = rr.Ellipsoids3D(

@@ -1,6 +1,6 @@
 //! What comes from Python.
 
-use freerange::{Camera, Compute, Options, Reconstructor, Solver, StartConfig, Up, View};
+use freerange::{Camera, Choices, Options, Reconstructor, Up, View};
 use freerange_camera::scene::nearest_rotation;
 use glam::{DMat3, DMat4, DVec3};
 use image::RgbaImage;
@@ -110,66 +110,43 @@ impl RawUp {
     }
 }
 
-/// What the caller says of sampling; the rest is the checkpoint's.
+/// What the caller chooses of the pipeline; the rest is the preset's.
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
-pub struct Sampling {
+pub struct RawOptions {
     seeds: Vec<u64>,
-    steps: Option<usize>,
-    refine: Option<usize>,
-    detail: Option<usize>,
-    ensemble: Option<usize>,
-    polish: Option<usize>,
-    mend: Option<usize>,
-    regroup: Option<usize>,
-    mirror: Option<f32>,
-    turn: Option<f32>,
-    start: Option<String>,
-    depth: Option<u32>,
-    cfg_scale: Option<f32>,
-    lambda_pg: Option<f32>,
-    solver: Option<String>,
-    compute: Option<String>,
-    views: Option<usize>,
+    quality: Option<String>,
+    iterations: Option<usize>,
+    symmetry: Option<String>,
+    init: Option<String>,
+    precision: Option<String>,
+    network_views: Option<usize>,
+    set: Vec<(String, String)>,
 }
 
-impl Sampling {
+impl RawOptions {
     /// As the command line makes them of the same options.
     pub fn options(self, model: &Reconstructor) -> PyResult<Options> {
-        let mut options = model.options().map_err(crate::error::of_model)?;
-        match self.start.as_deref() {
-            None => {}
-            Some("noise") => options.sample = options.sample.without_start(),
-            Some("fit") => {
-                options.sample.start.get_or_insert_with(StartConfig::default);
-            }
-            Some(found) => return Err(refuse("start", "'fit' or 'noise'", format!("'{found}'"))),
-        }
-        let sample = &mut options.sample;
-        sample.steps = self.steps.unwrap_or(sample.steps);
-        sample.depth = self.depth.or(sample.depth);
-        sample.cfg_scale = self.cfg_scale.unwrap_or(sample.cfg_scale);
-        sample.lambda_pg = self.lambda_pg.unwrap_or(sample.lambda_pg);
-        sample.refine = self.refine.unwrap_or(sample.refine);
-        sample.detail = self.detail.unwrap_or(sample.detail);
-        sample.polish = self.polish.unwrap_or(sample.polish);
-        sample.mend = self.mend.unwrap_or(sample.mend);
-        sample.regroup = self.regroup.unwrap_or(sample.regroup);
-        sample.mirror = self.mirror.unwrap_or(sample.mirror);
-        sample.turn = self.turn.unwrap_or(sample.turn);
-        sample.ensemble = self.ensemble.unwrap_or(sample.ensemble);
-        if let Some(name) = self.solver {
-            let solver: Option<Solver> = serde_json::from_value(name.as_str().into()).ok();
-            let expected = "'euler', 'heun', 'multistep' or 'hold'";
-            sample.solver = solver.ok_or_else(|| refuse("solver", expected, format!("'{name}'")))?;
-        }
-        if let Some(name) = self.compute {
-            let compute: Option<Compute> = serde_json::from_value(name.as_str().into()).ok();
-            let expected = "'f32', 'bf16', 'f16' or 'auto'";
-            sample.compute = compute.ok_or_else(|| refuse("compute", expected, format!("'{name}'")))?;
-        }
+        let choices = Choices {
+            quality: named("quality", self.quality, "'draft', 'default' or 'high'")?.unwrap_or_default(),
+            iterations: self.iterations,
+            symmetry: named("symmetry", self.symmetry, "'auto' or 'off'")?,
+            init: named("init", self.init, "'fit' or 'flow'")?,
+            precision: named("precision", self.precision, "'f32', 'bf16', 'f16' or 'auto'")?,
+            network_views: self.network_views,
+            set: self.set,
+        };
+        let mut options = model.options_of(&choices).map_err(crate::error::of_model)?;
         options.seeds = self.seeds;
-        options.views = self.views;
         Ok(options)
     }
+}
+
+/// One of some names.
+fn named<T: serde::de::DeserializeOwned>(field: &str, name: Option<String>, expected: &str) -> PyResult<Option<T>> {
+    let read = |name: String| {
+        let found = serde_json::from_value(name.as_str().into());
+        found.map_err(|_| refuse(field, expected, format!("'{name}'")))
+    };
+    name.map(read).transpose()
 }

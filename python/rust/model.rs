@@ -16,7 +16,7 @@ use glam::DVec3;
 use pyo3::{prelude::*, types::PyByteArray};
 
 use crate::{
-    arguments::{RawUp, RawView, Sampling, refuse, told, views},
+    arguments::{RawOptions, RawUp, RawView, refuse, told, views},
     error::{of_hub, of_model, of_scene},
     raster::bytes,
     scene::Scene,
@@ -74,11 +74,11 @@ impl Model {
 
     /// Most views that it has seen at once in training.
     #[getter]
-    fn views(&self) -> usize {
-        self.model.views()
+    fn network_views(&self) -> PyResult<usize> {
+        self.model.network_views().map_err(of_model)
     }
 
-    /// Gaussians that it makes, before refinement.
+    /// Gaussians that the network makes, before the optimization.
     #[getter]
     fn gaussians(&self) -> PyResult<usize> {
         self.model.gaussians().map_err(of_model)
@@ -95,14 +95,14 @@ impl Model {
         &self,
         py: Python<'_>,
         raw: Vec<RawView>,
-        sampling: Sampling,
+        chosen: RawOptions,
         up: RawUp,
         center: Option<[f64; 3]>,
         radius: Option<f64>,
         on_step: Option<Py<PyAny>>,
     ) -> PyResult<Made> {
         let mut views = views(raw)?;
-        let mut options = sampling.options(&self.model)?;
+        let mut options = chosen.options(&self.model)?;
         let center = center.map(DVec3::from);
         let up = up.read(false)?.unwrap_or_default();
         options.frame = FrameConfig { up, center, radius, ..FrameConfig::default() };
@@ -120,12 +120,12 @@ impl Model {
         &self,
         py: Python<'_>,
         scene: &Scene,
-        sampling: Sampling,
+        chosen: RawOptions,
         on_step: Option<Py<PyAny>>,
     ) -> PyResult<Made> {
-        let mut options = sampling.options(&self.model)?;
-        options.frame = scene.frame;
-        self.run(py, &scene.loaded.views, &options, scene.notes(), on_step)
+        let mut options = chosen.options(&self.model)?;
+        options.frame = scene.inner.frame;
+        self.run(py, scene.inner.views(), &options, scene.notes(), on_step)
     }
 }
 
@@ -148,11 +148,11 @@ impl Model {
                 last = Instant::now();
                 return Python::attach(|py| py.check_signals());
             };
-            let estimate = told.estimate().map_err(of_model)?;
+            let preview = told.preview().map_err(of_model)?;
             Python::attach(|py| {
                 py.check_signals()?;
-                let clouds = estimate.map(|clouds| clouds.iter().map(|c| bytes(py, c.rows())).collect::<Vec<_>>());
-                let told = (told.stage.name(), told.sample, told.done, told.total, told.loss, clouds);
+                let cloud = preview.map(|cloud| bytes(py, cloud.rows()));
+                let told = (told.stage.name(), told.sample, told.done, told.total, told.loss, cloud);
                 on_step.call1(py, told).map(drop)
             })
         };
@@ -170,7 +170,7 @@ impl Model {
         let samples = result.samples.iter().map(|s| bytes(py, s.gaussians.rows())).collect();
         // The canonical frame has +z up.
         let up = (result.canonical_from_user.rotation.inverse() * DVec3::Z).to_array();
-        notes.extend(result.notes);
+        notes.extend(result.notes.into_iter().map(|note| note.text));
         Ok((samples, up, notes, result.seconds.iter().map(|(stage, s)| (stage.name(), *s)).collect()))
     }
 }

@@ -2,31 +2,22 @@
 
 use std::path::PathBuf;
 
-use freerange::{Cloud, FrameConfig, View, others_show, write_ply};
+use freerange::{Cloud, Hints, LoadConfig, MaskSource, ReadConfig, SceneConfig, View, write_ply};
 use freerange_formats::{Format as FileFormat, Frame, WriteOptions};
-use freerange_scene::{
-    LoadConfig, Loaded, MaskSource, Note,
-    estimate::Hints,
-    load,
-    read::{Cameras, Format, ReadConfig, Turntable, cameras_with},
-    up_of,
-};
+use freerange_scene::read::{Format, Turntable};
 use glam::DVec3;
 use pyo3::{prelude::*, pybacked::PyBackedBytes, types::PyByteArray};
 
 use crate::{
     arguments::{RawCamera, RawUp, floats, raw_camera, refuse, told},
-    error::{of_format, of_scene},
+    error::{of_format, of_model},
     raster::bytes,
 };
 
 /// Photos with cameras, cut out.
 #[pyclass(frozen)]
 pub struct Scene {
-    cameras: Cameras,
-    pub loaded: Loaded,
-    pub frame: FrameConfig,
-    note: Option<Note>,
+    pub inner: freerange::Scene,
 }
 
 /// How photos are read; as on the command line.
@@ -67,21 +58,13 @@ pub fn read_scene(py: Python<'_>, path: PathBuf, photos: Photos, up: RawUp) -> P
         masks,
         invert_masks: photos.invert_masks,
         max_side: photos.max_side,
-        hints: Hints { center, radius: photos.radius, others: Some(others_show) },
+        hints: Hints { center, radius: photos.radius, others: None },
     };
     let up = up.read(true)?;
     py.detach(|| {
-        let cameras = cameras_with(&path, &read)?;
-        let loaded = load(&cameras, &config)?;
-        let (up, note) = match up {
-            Some(up) => (up, None),
-            None => up_of(&cameras, &loaded),
-        };
-        let center = center.map(|c| c - cameras.origin);
-        let frame = FrameConfig { up, center, radius: photos.radius, ..FrameConfig::default() };
-        Ok(Scene { cameras, loaded, frame, note })
+        let config = SceneConfig { cameras: read, photos: config, up };
+        Ok(Scene { inner: freerange::Scene::open_with(&path, &config).map_err(of_model)? })
     })
-    .map_err(of_scene)
 }
 
 /// A view: its name, its camera, RGBA of 8 bits.
@@ -96,12 +79,12 @@ fn all(py: Python<'_>, views: &[View]) -> Vec<Whole> {
 impl Scene {
     /// What it is reconstructed from.
     fn views(&self, py: Python<'_>) -> Vec<Whole> {
-        all(py, &self.loaded.views)
+        all(py, self.inner.views())
     }
 
     /// What it is only compared with.
     fn further(&self, py: Python<'_>) -> Vec<Whole> {
-        all(py, &self.loaded.further)
+        all(py, self.inner.further())
     }
 
     /// What was understood, for the user to read.
@@ -113,7 +96,7 @@ impl Scene {
 
 impl Scene {
     pub fn notes(&self) -> Vec<String> {
-        self.cameras.notes.iter().chain(&self.loaded.notes).chain(&self.note).map(|note| note.text.clone()).collect()
+        self.inner.notes.iter().map(|note| note.text.clone()).collect()
     }
 }
 

@@ -20,7 +20,7 @@ stage = [{ depth = 3, image_size = 16, batch = 2, steps = 60 }]
 
 [sample]
 steps = 1
-guidance = 1.0
+cfg_scale = 1.0
 gradient_size = 16
 
 [data]

@@ -27,7 +27,7 @@ stage = [
 
 [sample]
 steps = 1
-guidance = 1.0
+cfg_scale = 1.0
 gradient_size = 16
 
 [data]
@@ -145,14 +145,14 @@ assert "data.lanes: expected a multiple of the number of ranks, 3, found 4" in d
 assert done.returncode == 2 and done.stderr.count("data.lanes") == 1, (done.returncode, done.stderr)
 
 # Evaluation and many scenes: the same of each object, whoever measured it, and one report.
-objects = ["eval", "--generated", "3", "--generated-size", "32", "--pictures", "none", "--refine", "10", "--ensemble", "1"]
+objects = ["eval", "--generated", "3", "--generated-size", "32", "--pictures", "none", "--iterations", "10"]
 objects += ["--checkpoint", alone / "checkpoint.safetensors"]
 bowl = Path(__file__).resolve().parents[2] / "examples" / "bowl"
 names = ["first", "second", "third"]
 for name in names:
     shutil.copytree(bowl, place / "scenes" / name)
 (place / "scenes.txt").write_text("".join(f"scenes/{name}\n" for name in [*names[:2], "missing", names[2]]))
-scenes = ["reconstruct", "--list", place / "scenes.txt", "--refine", "10", "--ensemble", "1"]
+scenes = ["reconstruct", "--list", place / "scenes.txt", "--iterations", "10"]
 scenes += ["--checkpoint", alone / "checkpoint.safetensors"]
 
 

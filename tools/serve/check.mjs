@@ -232,7 +232,7 @@ try {
   check("reload", true, await evaluate("document.getElementById('status').textContent"));
 
   // Several samples, and where they differ.
-  await evaluate("Object.assign(document.getElementById('samples'), { value: 2 }); Object.assign(document.getElementById('refine'), { value: 60 }); document.getElementById('start-at').value = 'noise'");
+  await evaluate("Object.assign(document.getElementById('samples'), { value: 2 }); Object.assign(document.getElementById('iterations'), { value: 60 }); document.getElementById('init').value = 'flow'");
   await go();
   await state("done", 600);
   await until("Number(document.getElementById('heat').dataset.mean) > 0", 30);
@@ -253,7 +253,7 @@ try {
   check("errors of the page", errors.length === 0, errors.join("; ") || "none");
 
   // Killed in the middle of a job, and started again.
-  await evaluate("document.getElementById('start-at').value = ''");
+  await evaluate("document.getElementById('init').value = ''");
   await go();
   const gone = ended(program);
   program.kill("SIGKILL");

@@ -4,6 +4,7 @@ mod commands;
 mod error;
 mod output;
 mod photos;
+mod pipeline;
 mod progress;
 mod ranks;
 mod runtime;
@@ -25,7 +26,7 @@ struct Cli {
     #[command(subcommand)]
     command: Command,
     /// More messages on standard error (or set RUST_LOG).
-    #[arg(short, long, global = true)]
+    #[arg(short, long, global = true, hide_short_help = true)]
     verbose: bool,
 }
 

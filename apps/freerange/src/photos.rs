@@ -1,20 +1,16 @@
-//! Options that say how photos are read, and the scene that comes of them.
+//! Options that say how photos are read.
 
 use std::{
     path::{Path, PathBuf},
     str::FromStr,
 };
 
-use freerange::{FrameConfig, Reconstructor, Up, choose_views, others_show, to_canonical};
-use freerange_core::Note;
+use freerange::{Scene, SceneConfig, Up};
 use freerange_scene::{
-    LoadConfig, Loaded, MaskModel, MaskSource, PixelRange,
+    LoadConfig, MaskModel, MaskSource, PixelRange,
     estimate::Hints,
-    files,
-    inspect::view_warnings,
-    load,
+    files, load,
     read::{Cameras, Format, ReadConfig, Turntable, cameras, cameras_with},
-    up_of,
 };
 use glam::DVec3;
 
@@ -22,40 +18,48 @@ use crate::error::CliError;
 
 /// How photos are read.
 #[derive(clap::Args)]
+#[command(next_help_heading = "Photos and cameras")]
 pub struct Photos {
     /// Whose cameras to read where a folder has several: transforms, colmap, polycam, metashape, realitycapture or opf.
-    #[arg(long, value_name = "FORMAT", value_parser = parse_format)]
+    #[arg(long, value_name = "FORMAT", value_parser = parse_format, hide_short_help = true)]
     cameras: Option<Format>,
     /// The photos have no cameras: they were taken at even steps of one full turn of the object, in order of their names, from this
     /// elevation and with this field of view across the longer side, in degrees. The object turns counterclockwise as seen from above;
     /// add `,cw` for the other way.
-    #[arg(long, value_name = "ELEVATION,FOV", conflicts_with = "cameras", allow_hyphen_values = true)]
+    #[arg(
+        long,
+        value_name = "ELEVATION,FOV",
+        conflicts_with = "cameras",
+        allow_hyphen_values = true,
+        hide_short_help = true
+    )]
     turntable: Option<Turntable>,
     /// The folder of the photos, where they lie apart from the cameras (COLMAP, Polycam, Metashape, RealityCapture, OPF).
-    #[arg(long, value_name = "FOLDER")]
+    #[arg(long, value_name = "FOLDER", hide_short_help = true)]
     images: Option<PathBuf>,
-    /// Where the object's masks come from: a folder of them (NAME.png, white is the object), alpha, plain (one colour behind the object),
-    /// or estimate (from poses and colours) [default: the first of these that is there; folders are called masks].
+    /// Where masks come from: a folder, alpha, plain (one color behind the object) or estimate [default: what is there].
+    ///
+    /// A folder holds NAME.png, white is the object; without the option folders called masks are taken. estimate: from poses and colors.
     #[arg(long, value_name = "WHERE", value_parser = parse_masks)]
     masks: Option<MaskSource>,
     /// Masks from a segmentation network, an ONNX file such as u2netp.onnx: one input (1 x 3 x height x width), the first output is the
     /// mask. Needs a program built with --features mask-model.
-    #[arg(long, value_name = "FILE", conflicts_with = "masks")]
+    #[arg(long, value_name = "FILE", conflicts_with = "masks", hide_short_help = true, hide = !cfg!(feature = "mask-model"))]
     mask_model: Option<PathBuf>,
     /// What the network takes for pixels: imagenet (mean and deviation), unit (0 to 1), centered (-0.5 to 0.5), signed (-1 to 1).
-    #[arg(long, value_name = "RANGE", default_value = "imagenet", requires = "mask_model", value_parser = parse_range)]
+    #[arg(long, value_name = "RANGE", default_value = "imagenet", requires = "mask_model", value_parser = parse_range, hide_short_help = true, hide = !cfg!(feature = "mask-model"))]
     mask_model_pixels: PixelRange,
     /// In mask files black is the object.
-    #[arg(long)]
+    #[arg(long, hide_short_help = true)]
     invert_masks: bool,
-    /// Larger photos are made smaller: longer side in pixels.
-    #[arg(long, value_name = "PIXELS", default_value_t = 1024, value_parser = clap::value_parser!(u32).range(64..=16384))]
-    max_side: u32,
+    /// Longest side, in pixels, that photos are used at; larger ones are made smaller.
+    #[arg(long, value_name = "PIXELS", default_value_t = 1024, value_parser = clap::value_parser!(u32).range(64..=16384), hide_short_help = true)]
+    max_resolution: u32,
     /// The object's middle in the scene's frame [default: found from masks and cameras].
-    #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true)]
+    #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true, hide_short_help = true)]
     center: Option<DVec3>,
     /// The radius of a sphere about its middle that holds the object [default: found].
-    #[arg(long, value_name = "R")]
+    #[arg(long, value_name = "R", hide_short_help = true)]
     radius: Option<f64>,
 }
 
@@ -125,27 +129,6 @@ fn parse_point(text: &str) -> Result<DVec3, String> {
     }
 }
 
-/// A scene as it was read and cut out.
-pub struct Scene {
-    /// What the cameras' program told.
-    pub cameras: Cameras,
-    /// The views.
-    pub loaded: Loaded,
-    /// Where the object is, as far as it was told, and which way is up.
-    pub frame: FrameConfig,
-    /// What was understood, assumed, changed or left out, for the user to read.
-    pub notes: Vec<Note>,
-}
-
-impl Scene {
-    /// What may go wrong with its photos and masks, as `inspect` tells it.
-    pub fn warnings(&self, model: &Reconstructor) -> Result<Vec<Note>, CliError> {
-        let (frame, _) = to_canonical(&self.loaded.views, &self.frame)?;
-        let shown = choose_views(&self.loaded.views, model.views())?;
-        Ok(view_warnings(&self.loaded, &frame, &shown).into_iter().map(Note::warning).collect())
-    }
-}
-
 impl Photos {
     /// Reads the cameras of a scene.
     pub fn cameras(&self, scene: &Path) -> Result<Cameras, CliError> {
@@ -161,8 +144,8 @@ impl Photos {
         LoadConfig {
             masks,
             invert_masks: self.invert_masks,
-            max_side: self.max_side,
-            hints: Hints { center: self.center, radius: self.radius, others: Some(others_show) },
+            max_side: self.max_resolution,
+            hints: Hints { center: self.center, radius: self.radius, others: None },
         }
     }
 
@@ -181,7 +164,7 @@ impl Photos {
             mask_model,
             mask_model_pixels,
             invert_masks,
-            max_side,
+            max_resolution,
             center,
             radius,
         } = self;
@@ -192,7 +175,7 @@ impl Photos {
             ("images".into(), format!("{images:?}")),
             ("masks".into(), format!("{masks:?}")),
             ("invert-masks".into(), invert_masks.to_string()),
-            ("max-side".into(), max_side.to_string()),
+            ("max-resolution".into(), max_resolution.to_string()),
             ("center".into(), format!("{center:?}")),
             ("radius".into(), format!("{radius:?}")),
         ]
@@ -200,19 +183,11 @@ impl Photos {
 
     /// Reads a scene.
     pub fn load(&self, cameras: Cameras, up: UpChoice) -> Result<Scene, CliError> {
-        let loaded = load(&cameras, &self.config())?;
-        let mut notes: Vec<Note> = cameras.notes.iter().chain(&loaded.notes).cloned().collect();
         let up = match up {
-            UpChoice::Told(up) => up,
-            UpChoice::Auto => {
-                let (up, note) = up_of(&cameras, &loaded);
-                notes.extend(note);
-                up
-            }
+            UpChoice::Told(up) => Some(up),
+            UpChoice::Auto => None,
         };
-        let center = self.center.map(|c| c - cameras.origin);
-        let frame = FrameConfig { up, center, radius: self.radius, ..FrameConfig::default() };
-        Ok(Scene { cameras, loaded, frame, notes })
+        Ok(Scene::load(cameras, &SceneConfig { photos: self.config(), up, ..SceneConfig::default() })?)
     }
 
     /// Reads views that are only compared with: all of a scene's, relative to the same origin as those that they are compared with.

@@ -64,6 +64,7 @@ const ROOMS: &[(&str, &[&str])] = &[
             "freerange-core",
             "freerange-splat",
             "freerange-camera",
+            "freerange-scene",
             "freerange-raster",
             "freerange-model",
             "freerange-metrics",

@@ -33,8 +33,8 @@ fn bowl(to: &Path, scale: f64, shift: [f64; 3]) {
 
 /// Reconstructs as quickly as can be; the report, and what was said on standard error.
 fn reconstructed(scene: &Path, out: &Path, more: &[&str]) -> (Value, String) {
-    let mut args = vec!["reconstruct", scene.to_str().unwrap(), "-o", out.to_str().unwrap(), "--steps", "1"];
-    args.extend(["--refine", "0", "--ensemble", "1", "--mirror", "0", "--turn", "0"]);
+    let mut args = vec!["reconstruct", scene.to_str().unwrap(), "-o", out.to_str().unwrap(), "--iterations", "0"];
+    args.extend(["--set", "refine.passes=1", "--symmetry", "off"]);
     args.extend(more);
     let done = freerange(&args);
     let said = String::from_utf8_lossy(&done.stderr).into_owned();

@@ -51,8 +51,8 @@ fn refused(scene: &Path, extra: &[&str], words: &[&str]) {
     let place = tempfile::tempdir().unwrap();
     let output = place.path().join("result");
     let mut args =
-        vec!["reconstruct", scene.to_str().unwrap(), "-o", output.to_str().unwrap(), "--steps", "1", "--refine", "0"];
-    args.extend(["--mirror", "0", "--turn", "0"]);
+        vec!["reconstruct", scene.to_str().unwrap(), "-o", output.to_str().unwrap(), "--set", "refine.passes=1"];
+    args.extend(["--iterations", "0", "--symmetry", "off"]);
     args.extend(extra);
     let done = freerange(&args);
     let message = String::from_utf8_lossy(&done.stderr).into_owned();
@@ -84,12 +84,12 @@ fn reconstruct_writes_everything_and_its_cloud_can_be_rendered_from_the_users_ca
         scene.to_str().unwrap(),
         "-o",
         &out,
-        "--steps",
-        "3",
-        "--refine",
+        "--set",
+        "refine.passes=3",
+        "--iterations",
         "5",
-        "--detail",
-        "1",
+        "--set",
+        "optimize.max_resolution=256",
         "--json",
     ];
     let done = freerange(&args);
@@ -99,9 +99,9 @@ fn reconstruct_writes_everything_and_its_cloud_can_be_rendered_from_the_users_ca
         assert!(output.join(file).exists(), "{file}");
     }
     assert!(report["samples"][0]["further_views"]["psnr"].as_f64().unwrap() > 5.0);
-    assert!(report["samples"][0]["before_refinement"]["input_views"]["psnr"].as_f64().is_some());
+    assert!(report["samples"][0]["before_optimization"]["input_views"]["psnr"].as_f64().is_some());
     assert!(report["seconds"].as_array().unwrap().len() >= 4);
-    assert_eq!(report["gaussians"], 8192, "less detail is fewer Gaussians");
+    assert_eq!(report["gaussians"], 8192, "a lower resolution is fewer Gaussians");
 
     // What was exported, read back and rendered, is what was reported.
     let cameras = scene.join("transforms_test.json");
@@ -138,14 +138,12 @@ fn the_same_seed_gives_the_same_bytes() {
             scene.to_str().unwrap(),
             "-o",
             &out,
-            "--steps",
-            "2",
-            "--refine",
+            "--set",
+            "refine.passes=2",
+            "--iterations",
             "3",
-            "--mirror",
-            "0",
-            "--turn",
-            "0",
+            "--symmetry",
+            "off",
             "--seed",
             seed,
         ]);
@@ -157,9 +155,11 @@ fn the_same_seed_gives_the_same_bytes() {
 }
 
 #[test]
-fn no_detail_and_too_much() {
-    for (detail, found) in [("0", "found 0"), ("17", "found 17")] {
-        refused(&example(), &["--detail", detail], &["detail", "1 to 16", found]);
+fn resolutions_that_make_no_sense() {
+    for size in ["0", "300", "4352"] {
+        let set = format!("optimize.max_resolution={size}");
+        let found = format!("found {size}");
+        refused(&example(), &["--set", &set], &["optimize.max_resolution", "a multiple of 256, up to 4096", &found]);
     }
 }
 
@@ -173,7 +173,7 @@ fn missing_images() {
     // One is left out, and said to be.
     let output = s.path().join("out");
     let (scene, output) = (s.path().to_str().unwrap(), output.to_str().unwrap());
-    let quick = ["--steps", "1", "--refine", "0", "--mirror", "0", "--turn", "0"];
+    let quick = ["--set", "refine.passes=1", "--iterations", "0", "--symmetry", "off"];
     let done = freerange(&[&["reconstruct", scene, "-o", output][..], &quick].concat());
     let message = String::from_utf8_lossy(&done.stderr).into_owned();
     assert_eq!(done.status.code(), Some(0), "{message}");
@@ -282,12 +282,15 @@ fn a_ply_with_a_lying_element_count() {
 #[test]
 fn bad_numbers_on_the_command_line() {
     let s = scene();
-    refused(s.path(), &["--cfg-scale", "nan"], &["cfg_scale"]);
-    refused(s.path(), &["--photometric=-1"], &["lambda_pg"]);
+    refused(s.path(), &["--set", "propose.flow.cfg_scale=-2"], &["propose.flow.cfg_scale"]);
+    refused(s.path(), &["--set", "propose.flow.lambda_pg=nan"], &["propose.flow.lambda_pg", "nan"]);
     refused(Path::new("no/such/scene"), &[], &["no/such/scene"]);
-    // Options are looked at before photos are, and guidance is for noise.
-    refused(Path::new("no/such/scene"), &["--detail", "99"], &["sample.detail"]);
-    refused(Path::new("no/such/scene"), &["--cfg-scale", "2"], &["sample.cfg_scale", "sample.start"]);
+    // Options are looked at before photos are.
+    refused(Path::new("no/such/scene"), &["--set", "propose.count=99"], &["propose.count"]);
+    refused(Path::new("no/such/scene"), &["--set", "propose.cnt=2"], &["propose.cnt", "propose.count"]);
+    refused(Path::new("no/such/scene"), &["--set", "count"], &["KEY=VALUE"]);
+    // One proposal alone is used where nothing is optimized.
+    refused(Path::new("no/such/scene"), &["--set", "propose.count=2"], &["propose.count", "optimization"]);
     let done = freerange(&["train", "tiny", "-o", "no/such/run", "--save-every", "0"]);
     let message = String::from_utf8_lossy(&done.stderr).into_owned();
     assert_eq!(done.status.code(), Some(2), "{message}");
@@ -335,14 +338,12 @@ fn a_full_disk() {
             example().as_os_str(),
             "-o".as_ref(),
             output.as_os_str(),
-            "--steps".as_ref(),
-            "1".as_ref(),
-            "--refine".as_ref(),
+            "--set".as_ref(),
+            "refine.passes=1".as_ref(),
+            "--iterations".as_ref(),
             "0".as_ref(),
-            "--mirror".as_ref(),
-            "0".as_ref(),
-            "--turn".as_ref(),
-            "0".as_ref(),
+            "--symmetry".as_ref(),
+            "off".as_ref(),
         ])
         .output()
         .unwrap();
@@ -407,7 +408,9 @@ fn a_checkpoint_can_be_told_how_to_sample() {
     assert_ne!(old["sample"]["steps"], 7);
     assert!(new["settings_schema"].is_number());
     for provenance in [&mut old, &mut new] {
-        ["sample", "settings_schema"].iter().for_each(|field| drop(provenance[field].take()));
+        ["sample", "refiner", "network_views", "settings_schema"]
+            .iter()
+            .for_each(|field| drop(provenance[field].take()));
     }
     assert!(old == new && weights == same_weights, "nothing else changes");
 }

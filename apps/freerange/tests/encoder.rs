@@ -122,7 +122,8 @@ impl RunFolder {
 
     fn reconstruct(&self, checkpoint: &str, output: &str, extra: &[&str]) -> Vec<u8> {
         let (scene, output) = (example(), self.path(output));
-        let arguments = ["reconstruct", &scene, "-o", &output, "--checkpoint", checkpoint, "--photometric", "0"];
+        let arguments =
+            ["reconstruct", &scene, "-o", &output, "--checkpoint", checkpoint, "--set", "propose.flow.lambda_pg=0"];
         self.run(0, &[&arguments[..], extra].concat());
         fs::read(Path::new(&output).join("gaussians.ply")).unwrap()
     }

@@ -150,7 +150,7 @@ fn white_is_measured_resumed_refused_with_other_settings_and_restarted() {
     record["outcome"]["commit"] = "elsewhere".into();
     fs::write(object("b.full.4.json"), record.to_string()).unwrap();
     let message = expect(0, &run);
-    assert!(message.contains("commit elsewhere") && message.contains("--restart"), "{message}");
+    assert!(message.contains("commit elsewhere") && message.contains("--overwrite"), "{message}");
 
     // Nor is anything added to results whose settings meant something else.
     let settings = Path::new(&out).join("settings.json");
@@ -164,9 +164,9 @@ fn white_is_measured_resumed_refused_with_other_settings_and_restarted() {
 
     let other = [&run[..], &["--metrics", "psnr"]].concat();
     let message = expect(2, &other);
-    assert!(message.contains("metrics") && message.contains("--restart"), "{message}");
+    assert!(message.contains("metrics") && message.contains("--overwrite"), "{message}");
     assert_eq!(time("a.full.4.json"), before);
-    expect(0, &[&other[..], &["--restart"]].concat());
+    expect(0, &[&other[..], &["--overwrite"]].concat());
     assert!(outcome(&report(&out), "a", "full")["metrics"].get("ssim").is_none());
 }
 
@@ -269,11 +269,11 @@ fn bad_input_is_refused_with_exit_code_2() {
     refused(&["--scenes", &dir, "-o", &out, "--inputs", "1"], &["2..=64"]);
     refused(&["--scenes", &dir, "-o", &out, "--metrics", "psnr,beauty"], &["beauty", "psnr"]);
     refused(&["--scenes", &dir, "-o", &out, "--limit", "0"], &["nothing to evaluate"]);
-    refused(&["--scenes", &dir, "-o", &out, "--share", "2/2"], &["I/N"]);
-    refused(&["--scenes", &dir, "-o", &out, "--guidance", "nan"], &["cfg_scale"]);
+    refused(&["--scenes", &dir, "-o", &out, "--shard", "2/2"], &["I/N"]);
+    refused(&["--scenes", &dir, "-o", &out, "--set", "propose.flow.cfg_scale=-1"], &["cfg_scale"]);
     refused(&["compare", &dir, &dir], &["report.json"]);
     // A folder that holds something else is left alone.
-    let message = expect(2, &["eval", "--scenes", &dir, "--method", "white", "-o", &dir, "--restart"]);
+    let message = expect(2, &["eval", "--scenes", &dir, "--method", "white", "-o", &dir, "--overwrite"]);
     assert!(message.contains("empty folder"), "{message}");
     assert!(Path::new(&dir).join("a/transforms_val.json").exists());
 }
@@ -391,14 +391,12 @@ fn generated_objects_several_samples_shares_and_no_folder() {
         "32",
         "--views",
         "full",
-        "--steps",
-        "1",
-        "--refine",
+        "--set",
+        "refine.passes=1",
+        "--iterations",
         "0",
-        "--mirror",
-        "0",
-        "--turn",
-        "0",
+        "--symmetry",
+        "off",
         "--samples",
         "2",
         "--metrics",
@@ -406,7 +404,7 @@ fn generated_objects_several_samples_shares_and_no_folder() {
         "-o",
         &out,
     ];
-    expect(0, &[&run[..], &["--share", "0/2"]].concat());
+    expect(0, &[&run[..], &["--shard", "0/2"]].concat());
     assert!(!Path::new(&out).join("report.json").exists());
     assert_eq!(fs::read_dir(Path::new(&out).join("objects")).unwrap().count(), 2); // one record, one strip
     expect(0, &run);
@@ -463,18 +461,18 @@ fn ablations_change_one_setting_at_a_time_and_can_be_resumed() {
         &dir,
         "--views",
         "full",
-        "--start",
-        "noise",
-        "--refine",
+        "--init",
+        "flow",
+        "--iterations",
         "0",
-        "--steps",
-        "1",
-        "--mirror",
-        "0",
-        "--turn",
-        "0",
-        "--guidance",
-        "1.5",
+        "--set",
+        "refine.passes=1",
+        "--set",
+        "propose.flow.steps=1",
+        "--symmetry",
+        "off",
+        "--set",
+        "propose.flow.cfg_scale=1.5",
         "--sets",
         "guidance,steps,inputs",
         "--step-counts",
@@ -499,7 +497,9 @@ fn ablations_change_one_setting_at_a_time_and_can_be_resumed() {
     assert_ne!(line("no-guidance")["comparisons"][0]["metrics"][0]["difference"]["mean"], 0.0);
     assert_eq!(line("inputs-2")["comparisons"][0]["inputs"], serde_json::json!([4, 2]));
     assert!(study["without"][0]["name"].as_str().unwrap().contains('9'), "{}", study["without"]);
-    let settings = |folder: &str| report(&text(Path::new(&out).join(folder)))["settings"]["method"]["sample"].clone();
+    let settings = |folder: &str| {
+        report(&text(Path::new(&out).join(folder)))["settings"]["method"]["pipeline"]["propose"]["flow"].clone()
+    };
     assert_eq!(settings("no-classifier-free")["cfg_scale"], 1.0);
     assert_eq!(settings("no-classifier-free")["lambda_pg"], settings("default")["lambda_pg"]);
     assert_eq!(settings("steps-2")["steps"], 2);
@@ -511,7 +511,7 @@ fn ablations_change_one_setting_at_a_time_and_can_be_resumed() {
     expect(0, &run);
     assert_eq!(fs::metadata(&record).unwrap().modified().unwrap(), before);
     expect(2, &["eval", "ablations", "--scenes", &dir, "-o", &out, "--sets", "beauty"]);
-    expect(2, &["eval", "ablations", "--scenes", &dir, "-o", &out, "--sets", "solver", "--solvers", "magic"]);
+    expect(2, &["eval", "ablations", "--scenes", &dir, "-o", &out, "--sets", "guidance"]);
 }
 
 #[test]

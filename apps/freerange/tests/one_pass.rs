@@ -58,12 +58,10 @@ fn a_pixel_aligned_model_goes_through_every_command() {
     let reconstruct = ["reconstruct", scene, "--checkpoint", text(&checkpoint), "--device", "cpu", "-o", text(&out)];
     let with = |more: &[&str]| freerange(&[&reconstruct[..], more].concat());
     for (option, field) in [
-        (["--steps", "20"], "sample.steps"),
-        (["--cfg-scale", "2"], "sample.cfg_scale"),
-        (["--lambda-pg", "1"], "sample.lambda_pg"),
-        (["--start", "fit"], "sample.start"),
-        (["--depth", "8"], "sample.depth"),
-        (["--ensemble", "2"], "sample.ensemble"),
+        (["--set", "propose.flow.steps=20"], "propose.flow.steps"),
+        (["--set", "propose.flow.cfg_scale=2"], "propose.flow.cfg_scale"),
+        (["--set", "propose.flow.lambda_pg=1"], "propose.flow.lambda_pg"),
+        (["--set", "propose.flow.lod_depth=8"], "propose.flow.lod_depth"),
         (["--samples", "2"], "seeds"),
     ] {
         let refused = with(&option);
@@ -72,7 +70,11 @@ fn a_pixel_aligned_model_goes_through_every_command() {
         assert!(error.contains(field) && error.contains("pixel_aligned"), "{option:?}: {error}");
         assert!(!out.exists());
     }
-    let made = with(&["--refine", "3"]);
+    for option in [["--init", "fit"], ["--quality", "high"], ["--set", "propose.count=2"]] {
+        let refused = with(&option);
+        assert_eq!(refused.status.code(), Some(2), "{option:?}: {}", String::from_utf8_lossy(&refused.stderr));
+    }
+    let made = with(&["--iterations", "3"]);
     assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
     let report: serde_json::Value = serde_json::from_slice(&std::fs::read(out.join("report.json")).unwrap()).unwrap();
     assert!(report["gaussians"].as_u64().unwrap() >= 2 * 16 * 16, "two views, one Gaussian per pixel: {report}");

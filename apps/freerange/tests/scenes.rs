@@ -32,7 +32,7 @@ fn copy(from: &Path, to: &Path) {
 /// Makes the scenes of a list as quickly as can be; the exit code, the table, and what was said.
 fn made(list: &Path, out: &Path, more: &[&str]) -> (i32, Vec<Value>, String) {
     let mut args = vec!["reconstruct", "--list", list.to_str().unwrap(), "-o", out.to_str().unwrap(), "--json"];
-    args.extend(["--steps", "1", "--refine", "0", "--mirror", "0", "--turn", "0"]);
+    args.extend(["--set", "refine.passes=1", "--iterations", "0", "--symmetry", "off"]);
     args.extend(more);
     let done = freerange(&args);
     let said = String::from_utf8_lossy(&done.stderr).into_owned();
@@ -93,7 +93,7 @@ fn many_scenes_are_made_once_and_a_bad_one_ends_none() {
     let (code, _, said) = made(&list, &out, &["--seed", "3"]);
     assert_eq!(code, 2);
     assert!(
-        said.contains("scene.json") && said.contains("`seeds`: expected [0]") && said.contains("--restart"),
+        said.contains("scene.json") && said.contains("`seeds`: expected [0]") && said.contains("--overwrite"),
         "{said}"
     );
     assert_eq!(changed(&out.join("a-bowl/gaussians.ply")), before);
@@ -102,24 +102,27 @@ fn many_scenes_are_made_once_and_a_bad_one_ends_none() {
     let record = out.join("a-bowl/scene.json");
     let whole = fs::read_to_string(&record).unwrap();
     let mut json: Value = serde_json::from_str(&whole).unwrap();
-    for name in ["detail", "ensemble", "regroup", "polish"] {
-        assert!(json["options"][format!("sample.{name}")].is_string(), "{whole}");
+    for name in ["network_views", "symmetry", "propose", "refine", "optimize"] {
+        assert!(json["options"][format!("pipeline.{name}")].is_string(), "{whole}");
     }
     let schema = json["options"].as_object_mut().unwrap().remove("settings_schema").unwrap();
     fs::write(&record, json.to_string()).unwrap();
     let (code, _, said) = made(&list, &out, &[]);
-    assert!(code == 2 && said.contains("`settings_schema`: expected nothing") && said.contains("--restart"), "{said}");
+    assert!(
+        code == 2 && said.contains("`settings_schema`: expected nothing") && said.contains("--overwrite"),
+        "{said}"
+    );
     json["options"]["settings_schema"] = format!("{schema}0").into();
     fs::write(&record, json.to_string()).unwrap();
     let (code, _, said) = made(&list, &out, &[]);
     assert!(code == 2 && said.contains("`settings_schema`: expected "), "{said}");
     fs::write(&record, whole).unwrap();
 
-    let (code, rows, said) = made(&list, &out, &["--seed", "3", "--restart", "--share", "0/2"]);
+    let (code, rows, said) = made(&list, &out, &["--seed", "3", "--overwrite", "--shard", "0/2"]);
     assert_eq!((code, column(&rows, "scene")), (0, vec!["a-bowl", "b-bowl"]), "{said}");
     assert_eq!(column(&rows, "status"), ["done", "done"]);
     assert!(out.join("scenes-0-of-2.json").exists());
-    let (_, rows, _) = made(&list, &out, &["--seed", "3", "--restart", "--share", "1/2"]);
+    let (_, rows, _) = made(&list, &out, &["--seed", "3", "--overwrite", "--shard", "1/2"]);
     assert_eq!(column(&rows, "scene"), ["empty"]);
 }
 
@@ -163,7 +166,7 @@ fn a_view_that_sees_nothing_ends_no_batch() {
     fs::write(&record, broken).unwrap();
     let (code, _, said) = made(&list, &out, &[]);
     assert!(code == 2 && said.contains("scene.json"), "{said}");
-    let (code, rows, said) = made(&list, &out, &["--restart"]);
+    let (code, rows, said) = made(&list, &out, &["--overwrite"]);
     assert_eq!((code, column(&rows, "status")), (0, vec!["done", "done"]), "{said}");
 }
 
@@ -185,23 +188,23 @@ fn what_cannot_be_a_list_of_scenes_is_refused() {
     fs::write(&list, "# nothing\n").unwrap();
     says(&["--list", list_name], &["expected a scene on each line"]);
     says(&[bowl, bowl], &["bowl", "every scene once"]);
-    says(&[bowl, "elsewhere", "--validate", bowl], &["--validate", "one scene"]);
-    says(&[bowl, "--restart"], &["--restart", "several scenes"]);
-    says(&[bowl, "--share", "2/2"], &["0 to N - 1"]);
+    says(&[bowl, "elsewhere", "--eval-scene", bowl], &["--eval-scene", "one scene"]);
+    says(&[bowl, "--overwrite"], &["--overwrite", "several scenes"]);
+    says(&[bowl, "--shard", "2/2"], &["0 to N - 1"]);
 }
 
 #[test]
 fn photos_held_out_are_compared_with_and_not_used() {
     let place = tempfile::tempdir().unwrap();
     let out = place.path().join("out");
-    let args = |holdout: &'static str| {
+    let args = |holdout: &[&'static str]| {
         let (scene, out) = (example().to_str().unwrap().to_owned(), out.to_str().unwrap().to_owned());
-        let quick = ["--steps", "1", "--refine", "2", "--mirror", "0", "--turn", "0"];
-        let words = [&["reconstruct", &scene, "-o", &out], &quick[..], &["--json", "--holdout", holdout]].concat();
+        let quick = ["--set", "refine.passes=1", "--iterations", "2", "--symmetry", "off"];
+        let words = [&["reconstruct", &scene, "-o", &out], &quick[..], &["--json"], holdout].concat();
         words.into_iter().map(ToOwned::to_owned).collect::<Vec<_>>()
     };
-    let run = |holdout: &'static str| freerange(&args(holdout).iter().map(String::as_str).collect::<Vec<_>>());
-    let done = run("001,003.png");
+    let run = |holdout: &[&'static str]| freerange(&args(holdout).iter().map(String::as_str).collect::<Vec<_>>());
+    let done = run(&["--holdout", "001,003.png"]);
     assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
     let report: Value = serde_json::from_slice(&done.stdout).unwrap();
     // What it was made by can be traced.
@@ -209,13 +212,16 @@ fn photos_held_out_are_compared_with_and_not_used() {
     assert!(report["commit"].is_string() && report["settings_schema"].is_number());
     assert_eq!(report["checkpoint_sha256"].as_str().map(str::len), Some(64));
     assert_eq!(report["held_out"], serde_json::json!(["001", "003"]));
-    assert_eq!(report["views_shown"], serde_json::json!(["000", "002"]));
+    assert_eq!(report["network_views"], serde_json::json!(["000", "002"]));
     // The scene's own four further views, and these two; which are not among the inputs.
     let sample = &report["samples"][0];
     assert_eq!(sample["further_views"]["views"].as_array().unwrap().len(), 6);
     assert_eq!(sample["input_views"]["views"].as_array().unwrap().len(), 2);
     assert!(!out.join("inputs/001.png").exists() && out.join("inputs/000.png").exists());
-    let done = run("3");
+    let done = run(&["--holdout-every", "3"]);
+    let report: Value = serde_json::from_slice(&done.stdout).unwrap();
+    assert_eq!(report["held_out"], serde_json::json!(["000", "003"]));
+    let done = run(&["--holdout", "000,001,002"]);
     let said = String::from_utf8_lossy(&done.stderr).into_owned();
-    assert!(done.status.code() == Some(2) && said.contains("at most 2 of 4 photos, found 3"), "{said}");
+    assert!(done.status.code() == Some(2) && said.contains("at most 2 of 4 photos held out, found 3"), "{said}");
 }

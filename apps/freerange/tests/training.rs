@@ -21,7 +21,7 @@ stage = [
 
 [sample]
 steps = 1
-guidance = 1.0
+cfg_scale = 1.0
 gradient_size = 16
 
 [data]

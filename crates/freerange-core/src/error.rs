@@ -19,6 +19,12 @@ impl Invalid {
     pub fn new(field: impl Into<String>, expected: impl Into<String>, found: impl ToString) -> Self {
         Self { field: field.into(), expected: expected.into(), found: found.to_string() }
     }
+
+    /// The same of a field that lies within another one.
+    #[must_use]
+    pub fn within(self, outer: &str) -> Self {
+        Self { field: format!("{outer}.{}", self.field), ..self }
+    }
 }
 
 /// Refuses with the field's name unless `ok`, which is written so that NaN fails it.

@@ -27,14 +27,11 @@ pub enum Set {
     Gradient,
     /// Numbers of input views.
     Inputs,
-    /// Solvers, at several numbers of steps.
-    Solver,
 }
 
 impl Set {
     /// All of them.
-    pub const ALL: [Self; 7] =
-        [Self::Guidance, Self::Steps, Self::Lambda, Self::Scale, Self::Gradient, Self::Inputs, Self::Solver];
+    pub const ALL: [Self; 6] = [Self::Guidance, Self::Steps, Self::Lambda, Self::Scale, Self::Gradient, Self::Inputs];
 
     /// The name in commands and reports.
     pub fn name(self) -> &'static str {
@@ -45,7 +42,6 @@ impl Set {
             Self::Scale => "scale",
             Self::Gradient => "gradient",
             Self::Inputs => "inputs",
-            Self::Solver => "solver",
         }
     }
 }
@@ -53,7 +49,7 @@ impl Set {
 /// The values that sets run through.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Values {
-    /// Of [`Set::Steps`] and [`Set::Solver`].
+    /// Of [`Set::Steps`].
     pub steps: Vec<usize>,
     /// Of [`Set::Lambda`].
     pub lambda: Vec<f32>,
@@ -61,8 +57,6 @@ pub struct Values {
     pub scale: Vec<f32>,
     /// Of [`Set::Inputs`].
     pub inputs: Vec<usize>,
-    /// Of [`Set::Solver`].
-    pub solvers: Vec<String>,
 }
 
 /// One setting that differs from the default.
@@ -123,12 +117,6 @@ pub fn variants(sets: &[Set], values: &Values) -> Vec<Variant> {
             }),
             Set::Inputs => values.inputs.iter().for_each(|n| {
                 add(set, format!("{n} inputs"), format!("inputs-{n}"), json!({}), Some(*n));
-            }),
-            Set::Solver => values.solvers.iter().for_each(|solver| {
-                values.steps.iter().for_each(|n| {
-                    let sample = json!({ "solver": solver, "steps": n });
-                    add(set, format!("{solver}, {n} steps"), format!("solver-{solver}-{n}"), sample, None);
-                });
             }),
         }
     }
@@ -294,26 +282,19 @@ mod tests {
     use super::*;
 
     fn values() -> Values {
-        Values {
-            steps: vec![5, 50],
-            lambda: vec![0.5, 100.0],
-            scale: vec![1.25],
-            inputs: vec![2, 9],
-            solvers: vec!["heun".into()],
-        }
+        Values { steps: vec![5, 50], lambda: vec![0.5, 100.0], scale: vec![1.25], inputs: vec![2, 9] }
     }
 
     #[test]
     fn variants_change_what_they_say_and_have_folders_of_their_own() {
         let all = variants(&Set::ALL, &values());
-        assert_eq!(all.len(), 3 + 2 + 2 + 1 + 2 + 2 + 2);
+        assert_eq!(all.len(), 3 + 2 + 2 + 1 + 2 + 2);
         assert_eq!(all.iter().map(|v| &v.folder).collect::<HashSet<_>>().len(), all.len());
         let default = json!({ "steps": 50, "cfg_scale": 1.5, "lambda_pg": 500.0 });
         let of = |folder: &str| all.iter().find(|v| v.folder == folder).unwrap().apply(&default);
         assert_eq!(of("steps-5"), json!({ "steps": 5, "cfg_scale": 1.5, "lambda_pg": 500.0 }));
         assert_eq!(of("no-guidance"), json!({ "steps": 50, "cfg_scale": 1.0, "lambda_pg": 0.0 }));
         assert_eq!(of("inputs-9"), default);
-        assert_eq!(of("solver-heun-5")["solver"], "heun");
         assert_eq!(variants(&[Set::Scale], &values()).len(), 1);
         assert!(variants(&[], &values()).is_empty());
     }

@@ -21,7 +21,7 @@ pub enum EvalError {
     },
     /// A folder holds results of other settings.
     #[error(
-        "{} holds results of other settings: {}; choose another folder, or --restart to throw them away",
+        "{} holds results of other settings: {}; choose another folder, or --overwrite to throw them away",
         path.display(), differences.join("; ")
     )]
     Settings {
@@ -41,7 +41,7 @@ pub enum EvalError {
         found: String,
     },
     /// A report is asked for before all cases have been worked on.
-    #[error("{0}: no result yet; run the other shares first, then without --share")]
+    #[error("{0}: no result yet; run the other shards first, then without --shard")]
     NoRecord(String),
     /// Two reports cannot be compared.
     #[error("the reports cannot be compared: {0}")]

@@ -28,7 +28,6 @@ pub struct FitConfig {
     /// Optimisation steps.
     pub iterations: usize,
     /// Number of Gaussians never exceeded, and reached if there are enough growth steps.
-    #[serde(alias = "max_gaussians")]
     pub cap_max: usize,
     /// Number of Gaussians to start with, where no cloud is given; at most `cap_max`.
     pub initial: usize,
@@ -39,7 +38,6 @@ pub struct FitConfig {
     /// Radius of the sphere around the origin that holds the object. World units.
     pub radius: f64,
     /// Steps between two rounds of relocation and growth.
-    #[serde(alias = "growth_interval")]
     pub refine_every: usize,
     /// First step with such a round.
     pub growth_start: usize,
@@ -58,7 +56,6 @@ pub struct FitConfig {
     /// Weight of the mean standard deviation in the loss.
     pub scale_regularizer: f64,
     /// Strength of the noise that moves faint Gaussians, as a multiple of the centres' current learning rate.
-    #[serde(alias = "noise")]
     pub noise_lr: f64,
     /// Gaussians of at most this opacity are dead, and put where others are. 0..1
     pub dead_opacity: f64,

@@ -13,7 +13,7 @@ use crate::{
     coupling::Coupling,
     path::TimeSchedule,
     ranks::Wire,
-    sample::{GradientAt, SampleConfig},
+    sample::{FlowConfig, GradientAt, RefinerConfig},
 };
 
 /// A whole training run, with what `M` knows of how its objects are made.
@@ -40,9 +40,12 @@ pub struct TrainConfig<M = ()> {
     /// Measuring on other objects while training.
     #[serde(default)]
     pub validation: ValidationConfig,
-    /// How the finished model samples, unless the user says otherwise; kept in the checkpoint.
+    /// How the finished model is sampled from, unless the user says otherwise; kept in the checkpoint.
     #[serde(default)]
-    pub sample: SampleConfig,
+    pub sample: FlowConfig,
+    /// How the finished model refines initial fits, if it learns to (`loss.start`); kept in the checkpoint.
+    #[serde(default)]
+    pub refiner: Option<RefinerConfig>,
 }
 
 /// Where training objects come from, and how they are used.
@@ -155,7 +158,7 @@ pub struct StartLoss {
     #[serde(default = "one")]
     pub noise: f32,
     /// Of those batches, the share at the start itself: all that the network can say there comes from the images and the fit,
-    /// whereas a sample on the way to the data shows where it goes. What [`Solver::Hold`](crate::sample::Solver::Hold) wants.
+    /// whereas a sample on the way to the data shows where it goes. What a [`Refiner`](crate::sample::Refiner) wants.
     #[serde(default)]
     pub hold: f32,
     /// Weight of the rendering losses at the start; left out: that of its time, `w(t)`.
@@ -389,10 +392,10 @@ impl<M> TrainConfig<M> {
 
     /// The same without how objects are made, and that.
     pub fn apart(self) -> (TrainConfig, M) {
-        let Self { seed, model, data, loss, optimizer, stages, validation, sample } = self;
+        let Self { seed, model, data, loss, optimizer, stages, validation, sample, refiner } = self;
         let DataConfig { shards, partial, window, fresh, workers, lanes, statistics_objects, making } = data;
         let data = DataConfig { shards, partial, window, fresh, workers, lanes, statistics_objects, making: () };
-        (TrainConfig { seed, model, data, loss, optimizer, stages, validation, sample }, making)
+        (TrainConfig { seed, model, data, loss, optimizer, stages, validation, sample, refiner }, making)
     }
 }
 
@@ -421,7 +424,9 @@ impl<M: Making> TrainConfig<M> {
             false => Err(Invalid::new(field, expected, found)),
         };
         self.model.validate()?;
-        self.sample.validate()?;
+        self.sample.validate().map_err(|e| e.within("sample"))?;
+        let refiner = self.refiner.as_ref().map_or(Ok(()), RefinerConfig::validate);
+        refiner.map_err(|e| e.within("refiner"))?;
         check(!self.stages.is_empty(), "stage", "at least one [[stage]]", "none".into())?;
         self.data.making.check(self.seed, &self.depths())?;
         for s in &self.stages {
@@ -533,8 +538,11 @@ impl<M: Making> TrainConfig<M> {
         for s in &self.stages {
             check((1usize << s.depth) >= p, "stage.depth", "at least one token", s.depth.to_string())?;
         }
-        if let Some(depth) = self.sample.depth {
-            check((1usize << depth) >= p, "sample.depth", "at least one token", depth.to_string())?;
+        let refined = self.refiner.as_ref().and_then(|r| r.lod_depth);
+        for (field, depth) in [("sample.lod_depth", self.sample.lod_depth), ("refiner.lod_depth", refined)] {
+            if let Some(depth) = depth {
+                check((1usize << depth) >= p, field, "at least one token", depth.to_string())?;
+            }
         }
         Ok(())
     }
@@ -542,7 +550,7 @@ impl<M: Making> TrainConfig<M> {
     /// Refuses losses and sampling that a model of this kind does not have.
     fn validate_kind(&self) -> Result<(), FlowError> {
         let (kind, l) = (self.model.kind, &self.loss);
-        self.sample.validate_for(kind)?;
+        self.sample.validate_for(kind).map_err(|e| e.within("sample"))?;
         if !kind.one_pass() {
             return Ok(());
         }
@@ -559,6 +567,7 @@ impl<M: Making> TrainConfig<M> {
         check(!l.random_patches, "loss.random_patches", "false", "true".into())?;
         check(l.coupling == Coupling::Independent, "loss.coupling", "independent", "tree".into())?;
         check(l.start.is_none(), "loss.start", "none", "one".into())?;
+        check(self.refiner.is_none(), "refiner", "none", "one".into())?;
         if kind == ModelKind::LatentTokens {
             let most = self.model.gaussians(0, 0);
             for s in &self.stages {

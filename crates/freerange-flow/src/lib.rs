@@ -1,6 +1,6 @@
 //! Flow matching over Gaussians: the path, the losses, guidance, the solver, and the trainer.
 //!
-//! Start with [`train::step`] (Section 3 of the paper) and [`sample::reconstruct`] (Section 3.5).
+//! Start with [`train::step`] (Section 3 of the paper) and [`sample::FlowSampler`] (Sections 3.3 and 3.6).
 
 pub mod batch;
 pub mod config;
@@ -15,6 +15,7 @@ pub mod photometric;
 mod place;
 pub mod ranks;
 pub mod sample;
+pub mod settings;
 pub mod symmetry;
 pub mod train;
 pub mod trainer;

@@ -29,7 +29,7 @@ use crate::{
     optimizer::AdamW,
     photometric::Photometric,
     ranks::{Ranks, agree, gather},
-    sample::SETTINGS_SCHEMA,
+    settings::Settings,
     validation::{Figures, Validation},
     weights::Weights,
 };
@@ -148,15 +148,19 @@ impl Trainer {
     fn checkpoint(&self, average: FreeRange) -> Result<Checkpoint, FlowError> {
         let stage = self.config.stage(self.progress.step.saturating_sub(1));
         let config = ModelConfig { image_size: stage.image_size, ..self.config.model.architecture() };
-        let provenance = serde_json::json!({
+        let mut provenance = serde_json::json!({
             "configuration": self.described,
             "steps": self.progress.step,
             "samples": self.samples(),
             "training_seconds": self.progress.seconds,
             "program": concat!("freerange ", env!("CARGO_PKG_VERSION")),
-            "settings_schema": SETTINGS_SCHEMA,
-            "sample": self.config.sample,
         });
+        let settings = Settings {
+            network_views: self.config.loss.input_views.1,
+            sample: self.config.sample.clone(),
+            refiner: self.config.refiner.clone(),
+        };
+        settings.write(provenance.as_object_mut().expect("just made"));
         Ok(Checkpoint {
             config,
             model: average.put_dinov2(self.frozen.clone()),

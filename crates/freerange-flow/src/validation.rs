@@ -21,7 +21,7 @@ use crate::{
     config::{Stage, TrainConfig},
     photometric::Photometric,
     ranks::{Ranks, gather},
-    sample::{Estimate, SampleConfig, reconstruct},
+    sample::{Estimate, FlowConfig, FlowSampler, Refiner, RefinerConfig},
     train,
 };
 
@@ -164,8 +164,8 @@ impl Validation {
         if gather(ranks, &[u8::from(own)])?.contains(&vec![1]) {
             return Ok(());
         }
-        let fits = "initial fits of their input views, which sample.start begins with (data.object.input_fits), and ";
-        let fits = if config.sample.start.is_some() { fits } else { "" };
+        let fits = "initial fits of their input views, which the refiner begins with (data.object.input_fits), and ";
+        let fits = if config.refiner.is_some() { fits } else { "" };
         let expected = format!("objects with {fits}views beside the input views to compare with");
         Err(Invalid::new("validation.objects", expected, "none").into())
     }
@@ -202,17 +202,10 @@ impl Validation {
             let &[flow, seen, held] = figures.as_slice() else { return Err(FlowError::device(&figures)) };
             let mut psnr = Vec::new();
             for (inputs, others, fit) in self.tasks(object, config, *number) {
-                // The size that objects come in is the size that they are sampled and compared at.
-                let depth = (!config.model.kind.one_pass()).then_some(stage.depth);
-                let sample = SampleConfig { depth, ..config.sample.clone() };
-                let fits = fit.map(|fit| [fit]);
-                let fits = fits.as_ref().map(<[Cloud; 1]>::as_slice);
-                let go_on =
-                    |_: &Estimate| if interrupted() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) };
-                let found = reconstruct(checkpoint, &[&inputs], fits, &sample, &[self.seed], device, go_on)?;
-                psnr.push(psnr_over_white(&found[0][0], &others)?);
+                let found = self.reconstruct(checkpoint, config, stage, &inputs, fit.as_ref(), device, interrupted)?;
+                psnr.push(psnr_over_white(&found, &others)?);
                 if pictures.len() < PICTURED.0 {
-                    pictures.push(picture(&found[0][0], &others)?);
+                    pictures.push(picture(&found, &others)?);
                 }
             }
             measured.push(Measured { object: *number, losses: [flow, seen, held], psnr });
@@ -220,7 +213,34 @@ impl Validation {
         Ok((measured, pictures))
     }
 
-    /// What is sampled of an object: from each of its fits where sampling starts from one, else from one choice of views.
+    /// What the model makes of some views: a refinement of `fit`, or a sample from noise.
+    fn reconstruct(
+        &self,
+        checkpoint: &Checkpoint,
+        config: &TrainConfig,
+        stage: &Stage,
+        inputs: &[View],
+        fit: Option<&Cloud>,
+        device: &Device,
+        interrupted: &dyn Fn() -> bool,
+    ) -> Result<Cloud, FlowError> {
+        // The size that objects come in is the size that they are sampled and compared at.
+        let lod_depth = (!config.model.kind.one_pass()).then_some(stage.depth);
+        let go_on = |_: &Estimate| if interrupted() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) };
+        let mut found = match (&config.refiner, fit) {
+            (Some(refiner), Some(fit)) => {
+                let config = &RefinerConfig { lod_depth, ..refiner.clone() };
+                Refiner { checkpoint, config, device }.refine(&[inputs], std::slice::from_ref(fit), go_on)?
+            }
+            _ => {
+                let config = &FlowConfig { lod_depth, ..config.sample.clone() };
+                FlowSampler { checkpoint, config, device }.sample(&[inputs], &[self.seed], go_on)?
+            }
+        };
+        Ok(found.remove(0))
+    }
+
+    /// What is measured of an object: each of its fits where the model refines fits, else one choice of views.
     /// Nothing where no view is left to compare with.
     fn tasks<M>(&self, object: &Object, config: &TrainConfig<M>, number: u64) -> Vec<Task> {
         let (fewest, most) = config.loss.input_views;
@@ -228,7 +248,7 @@ impl Validation {
             let views = |views: Vec<&View>| views.into_iter().cloned().collect::<Vec<View>>();
             (views(chosen), views(rest.into_iter().take(COMPARED).collect()), fit)
         };
-        let tasks = if config.sample.start.is_none() {
+        let tasks = if config.refiner.is_none() {
             let mut rng = step_rng(!self.seed, number);
             let count = 4usize.clamp(fewest, most);
             vec![of(choose_views(&object.views, count, false, &mut rng), None)]

@@ -5,7 +5,8 @@ use std::path::PathBuf;
 use burn::tensor::{Device, Tensor, TensorData};
 use freerange_flow::{
     path::{cosine_time, flow_loss, interpolate, render_weight},
-    sample::{SampleConfig, Solver, classifier_free, integrate},
+    sample::{classifier_free, integrate},
+    settings::Settings,
 };
 use freerange_splat::{Cloud, Normalization};
 use freerange_vectors::{Vectors, assert_close, json};
@@ -91,9 +92,7 @@ fn euler_with_both_guidances_on_the_toy_model() {
         let mut estimates = Vec::new();
         let last = integrate(
             noise,
-            0.0,
             steps,
-            Solver::Euler,
             |step| {
                 if step.index > 0 {
                     trajectory.extend(values(step.z.clone()));
@@ -107,10 +106,7 @@ fn euler_with_both_guidances_on_the_toy_model() {
                 Ok(guided)
             },
             // The reference's result is the last estimate, without a push.
-            |step, estimate| {
-                let displacement = (estimate.clone() - target.clone()).mul_scalar(kappa * lambda);
-                Ok((step.index + 1 < steps).then_some(displacement))
-            },
+            |_, estimate| Ok(Some((estimate.clone() - target.clone()).mul_scalar(kappa * lambda))),
         )
         .unwrap();
         let expected = v.floats("out/trajectory");
@@ -137,7 +133,7 @@ fn toy_cases() -> Vec<(String, usize, f32, f32, f32)> {
         .collect()
 }
 
-/// It was written when the scales had other names.
+/// It was written under schema 1.
 #[test]
 fn the_shipped_checkpoints_settings_are_understood() {
     let path = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../checkpoints/tiny.safetensors"));
@@ -145,9 +141,9 @@ fn the_shipped_checkpoints_settings_are_understood() {
     let (_, header) = safetensors::SafeTensors::read_metadata(&bytes).unwrap();
     let provenance = &header.metadata().as_ref().unwrap()["provenance"];
     let provenance: serde_json::Value = serde_json::from_str(provenance).unwrap();
-    let said = &provenance["sample"];
-    let number = |now: &str, then: &str| said.get(now).or(said.get(then)).unwrap().as_f64().unwrap() as f32;
-    let found: SampleConfig = serde_json::from_value(said.clone()).unwrap();
-    assert_eq!(found.cfg_scale, number("cfg_scale", "guidance"));
-    assert_eq!(found.lambda_pg, number("lambda_pg", "photometric"));
+    assert!(provenance.get("settings_schema").is_none());
+    let Settings { network_views, sample, refiner } = Settings::of(&provenance).unwrap();
+    let refiner = refiner.expect("it refines initial fits");
+    assert_eq!((network_views, refiner.passes, refiner.retokenize_every, refiner.lod_depth), (6, 12, 4, Some(11)));
+    assert_eq!((sample.steps, sample.cfg_scale, sample.gradient_size), (50, 1.0, 128));
 }

@@ -7,7 +7,7 @@ use freerange_data::{Object, ObjectSource};
 use freerange_flow::{
     batch::{Batch, step_rng},
     photometric::Photometric,
-    sample::reconstruct,
+    sample::FlowSampler,
     train,
     trainer::Trainer,
 };
@@ -133,11 +133,10 @@ fn gpu_samples_as_the_cpu_does() {
             depth: 5,
             provenance: serde_json::Value::Null,
         };
-        let clouds =
-            reconstruct(&checkpoint, &views, None, &config.sample, &[1, 2], device, |_| ControlFlow::Continue(()))
-                .unwrap();
-        assert_eq!(clouds.iter().map(Vec::len).collect::<Vec<_>>(), [2, 2]);
-        clouds.iter().flatten().flat_map(|c| c.rows().to_vec()).collect::<Vec<f32>>()
+        let sampler = FlowSampler { checkpoint: &checkpoint, config: &config.sample, device };
+        let clouds = sampler.sample(&views, &[1, 2], |_| ControlFlow::Continue(())).unwrap();
+        assert_eq!(clouds.len(), 4);
+        clouds.iter().flat_map(|c| c.rows().to_vec()).collect::<Vec<f32>>()
     };
     close(&rows(&gpu()), &rows(&Device::flex()), 2e-3);
 }

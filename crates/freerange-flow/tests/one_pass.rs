@@ -9,7 +9,7 @@ use freerange_data::ObjectSource;
 use freerange_fit::psnr_over_white;
 use freerange_flow::{
     FlowError,
-    sample::{SampleConfig, reconstruct},
+    sample::{FlowConfig, FlowSampler},
     trainer::Trainer,
 };
 use freerange_model::Checkpoint;
@@ -112,14 +112,15 @@ fn each_kind_learns_an_object() {
         let (inputs, others) = views(&config);
         let quality = |checkpoint: &Checkpoint| {
             let mut told = 0;
-            let found = reconstruct(checkpoint, &[&inputs], None, &config.sample, &[0], &Device::flex(), |estimate| {
-                told += estimate.clouds().unwrap()[0].len();
+            let sampler = FlowSampler { checkpoint, config: &config.sample, device: &Device::flex() };
+            let found = sampler.sample(&[&inputs], &[0], |estimate| {
+                told += estimate.clouds().unwrap().len();
                 ControlFlow::Continue(())
             });
             let found = found.unwrap();
-            assert_eq!((told, found[0].len()), (1, 1));
-            assert_eq!(found[0][0].len(), checkpoint.config.gaussians(6, inputs.len()));
-            psnr_over_white(&found[0][0], &others).unwrap()
+            assert_eq!((told, found.len()), (1, 1));
+            assert_eq!(found[0].len(), checkpoint.config.gaussians(6, inputs.len()));
+            psnr_over_white(&found[0], &others).unwrap()
         };
         let before = quality(&train(&config, folder.path(), 1));
         let after = quality(&train(&config, folder.path(), steps));
@@ -144,19 +145,16 @@ fn settings_of_the_flow_are_refused() {
     let config = config(KINDS[1], 1);
     let checkpoint = train(&config, folder.path(), 1);
     let (inputs, _) = views(&config);
-    let sample = |sample: SampleConfig, seeds: &[u64]| {
-        reconstruct(&checkpoint, &[&inputs], None, &sample, seeds, &Device::flex(), |_| ControlFlow::Continue(()))
-            .unwrap_err()
-            .to_string()
+    let sample = |sample: FlowConfig, seeds: &[u64]| {
+        let sampler = FlowSampler { checkpoint: &checkpoint, config: &sample, device: &Device::flex() };
+        sampler.sample(&[&inputs], seeds, |_| ControlFlow::Continue(())).unwrap_err().to_string()
     };
     let own = || config.sample.clone();
     for (field, found) in [
-        ("sample.steps", sample(SampleConfig { steps: 50, ..own() }, &[0])),
-        ("sample.cfg_scale", sample(SampleConfig { cfg_scale: 2.0, ..own() }, &[0])),
-        ("sample.lambda_pg", sample(SampleConfig { lambda_pg: 1.0, ..own() }, &[0])),
-        ("sample.start", sample(SampleConfig { start: Some(Default::default()), ..own() }, &[0])),
-        ("sample.depth", sample(SampleConfig { depth: Some(5), ..own() }, &[0])),
-        ("sample.ensemble", sample(SampleConfig { ensemble: 4, ..own() }, &[0])),
+        ("sample.steps", sample(FlowConfig { steps: 50, ..own() }, &[0])),
+        ("sample.cfg_scale", sample(FlowConfig { cfg_scale: 2.0, ..own() }, &[0])),
+        ("sample.lambda_pg", sample(FlowConfig { lambda_pg: 1.0, ..own() }, &[0])),
+        ("sample.lod_depth", sample(FlowConfig { lod_depth: Some(5), ..own() }, &[0])),
         ("seeds", sample(own(), &[0, 1])),
     ] {
         assert!(found.contains(field) && found.contains("pixel_aligned"), "{field}: {found}");
@@ -170,6 +168,7 @@ fn settings_of_the_flow_are_refused() {
         ("loss.flow", loss(&|c| c.loss.flow = true)),
         ("loss.unconditional", loss(&|c| c.loss.unconditional = 0.1)),
         ("sample.steps", loss(&|c| c.sample.steps = 4)),
+        ("refiner", loss(&|c| c.refiner = Some(Default::default()))),
         ("stage.depth", loss(&|c| c.stages[0].depth = 5)),
         ("loss: expected at least one term", loss(&|c| (c.loss.seen, c.loss.held) = (false, false))),
     ] {

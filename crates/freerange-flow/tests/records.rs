@@ -3,13 +3,13 @@
 use freerange_flow::{
     ValidationConfig,
     config::{FrameJitter, LossConfig, OptimizerConfig, Stage, StartLoss, Symmetries},
-    sample::{FromNoise, SampleConfig, StartConfig},
+    sample::{FlowConfig, RefinerConfig},
 };
 use freerange_model::{Dinov2Config, ModelConfig, PatchConfig};
 use serde::{Serialize, de::DeserializeOwned};
 use serde_json::{Value, json};
 
-/// The names that a struct can be read from: serde lists them where it refuses another one. Former names among them.
+/// The names that a struct can be read from: serde lists them where it refuses another one.
 fn names<T: DeserializeOwned>() -> Vec<String> {
     let refusal = serde_json::from_value::<T>(json!({ "?": 0 })).err().expect("no such field").to_string();
     let names: Vec<String> = refusal.split('`').skip(3).step_by(2).map(str::to_owned).collect();
@@ -20,19 +20,16 @@ fn names<T: DeserializeOwned>() -> Vec<String> {
 /// Names of fields that a record of `value` lacks.
 fn missing<T: Serialize + DeserializeOwned>(value: &T) -> Vec<String> {
     let record = serde_json::to_value(value).unwrap();
-    let former = ["guidance", "photometric"];
-    names::<T>().into_iter().filter(|name| record.get(name).is_none() && !former.contains(&name.as_str())).collect()
+    names::<T>().into_iter().filter(|name| record.get(name).is_none()).collect()
 }
 
 #[test]
 fn every_field_of_every_setting_is_recorded() {
     let start: StartLoss = serde_json::from_value(json!({ "share": 0.5, "time": 0.0 })).unwrap();
     let stage: Stage = serde_json::from_value(json!({ "depth": 4, "image_size": 16, "batch": 2, "steps": 1 })).unwrap();
-    let noise: FromNoise = serde_json::from_value(json!({ "steps": 3, "solver": "euler", "lambda_pg": 0.5 })).unwrap();
     let found = [
-        missing(&SampleConfig::default()),
-        missing(&StartConfig::default()),
-        missing(&noise),
+        missing(&FlowConfig::default()),
+        missing(&RefinerConfig::default()),
         missing(&LossConfig::default()),
         missing(&start),
         missing(&FrameJitter::default()),
@@ -49,9 +46,9 @@ fn every_field_of_every_setting_is_recorded() {
 
 #[test]
 fn a_record_is_read_as_what_was_recorded() {
-    let sample = SampleConfig { detail: 1, ensemble: 1, ..SampleConfig::default() };
+    let sample = FlowConfig { steps: 20, cfg_scale: 1.5, ..FlowConfig::default() };
     let record = serde_json::to_value(&sample).unwrap();
-    assert_eq!((&record["detail"], &record["ensemble"]), (&json!(1), &json!(1)));
-    assert_eq!(record["depth"], Value::Null);
-    assert_eq!(serde_json::from_value::<SampleConfig>(record).unwrap(), sample);
+    assert_eq!((&record["steps"], &record["cfg_scale"]), (&json!(20), &json!(1.5)));
+    assert_eq!(record["lod_depth"], Value::Null);
+    assert_eq!(serde_json::from_value::<FlowConfig>(record).unwrap(), sample);
 }

@@ -12,7 +12,7 @@ use freerange_flow::{
     batch::{Batch, step_rng},
     config::{FrameJitter, RateSchedule, Symmetries},
     photometric::{Photometric, Targets},
-    sample::{Estimate, PhotometricStep, SampleConfig, reconstruct},
+    sample::{Estimate, FlowConfig, FlowSampler, Refiner, RefinerConfig},
     trainer::{Initial, Trainer},
 };
 use freerange_metrics::psnr;
@@ -76,7 +76,7 @@ steps = STEPS
 
 [sample]
 steps = 20
-guidance = 1.0
+cfg_scale = 1.0
 gradient_size = 32
 coupling = "tree"
 "#;
@@ -99,6 +99,11 @@ fn train(config: &TrainConfig, folder: &std::path::Path, stop_at: u64) -> Vec<f3
 
 fn go(_: &Estimate<'_>) -> ControlFlow<()> {
     ControlFlow::Continue(())
+}
+
+/// Samples of `objects` from noise: object by object, and of each one seed after the other.
+fn sample(checkpoint: &Checkpoint, objects: &[&[View]], config: &FlowConfig, seeds: &[u64]) -> Vec<Cloud> {
+    FlowSampler { checkpoint, config, device: &Device::flex() }.sample(objects, seeds, go).unwrap()
 }
 
 /// Mean PSNR of renders of `rows` against `views`, on white.
@@ -131,7 +136,7 @@ fn one_object_is_learned_sampled_and_rendered() {
     };
     let object = source.object(0).unwrap();
     let (inputs, unseen) = object.views.split_at(4);
-    let clouds = reconstruct(&checkpoint, &[inputs], None, &config.sample, &[5, 6], &device, go).unwrap().remove(0);
+    let clouds = sample(&checkpoint, &[inputs], &config.sample, &[5, 6]);
     assert_eq!(clouds.len(), 2);
     assert_ne!(clouds[0], clouds[1], "another seed is another sample");
 
@@ -146,41 +151,22 @@ fn one_object_is_learned_sampled_and_rendered() {
         );
     }
 
-    // What photometric guidance follows, and on what images, is as configured.
-    let ways = [
-        (0.0, PhotometricStep::Gradient, 1, None),
-        (50.0, PhotometricStep::Gradient, 1, None),
-        (0.1, PhotometricStep::Scaled, 1, None),
-        (0.1, PhotometricStep::Scaled, 2, None),
-        (0.1, PhotometricStep::Scaled, 1, Some(16)),
-        (0.1, PhotometricStep::Scaled, 1, Some(32)),
-    ];
-    let sampled = ways.map(|(lambda_pg, photometric_step, photometric_repeats, photometric_size)| {
-        let guidance = SampleConfig {
-            lambda_pg,
-            photometric_step,
-            photometric_repeats,
-            photometric_size,
-            ..config.sample.clone()
-        };
-        reconstruct(&checkpoint, &[inputs], None, &guidance, &[5], &device, go).unwrap().remove(0).remove(0)
-    });
-    for (i, a) in sampled[..5].iter().enumerate() {
-        assert!(sampled[..i].iter().all(|b| a != b), "each way is another one");
-    }
-    assert_eq!((config.sample.photometric_step, config.sample.photometric_repeats), (PhotometricStep::Gradient, 1));
-    assert_eq!(sampled[5], sampled[2], "gradient_size is what a left out photometric_size means");
+    let guided = |lambda_pg: f32| {
+        sample(&checkpoint, &[inputs], &FlowConfig { lambda_pg, ..config.sample.clone() }, &[5]).remove(0)
+    };
+    assert_ne!(guided(0.0), guided(50.0));
 
     // A single step is guided, too: its result is.
     let single = |lambda_pg: f32| {
-        let one = SampleConfig { steps: 1, lambda_pg, ..config.sample.clone() };
-        reconstruct(&checkpoint, &[inputs], None, &one, &[5], &device, go).unwrap().remove(0).remove(0)
+        let one = FlowConfig { steps: 1, lambda_pg, ..config.sample.clone() };
+        sample(&checkpoint, &[inputs], &one, &[5]).remove(0)
     };
     assert_ne!(single(0.0), single(50.0));
 
     // Every step's estimate is told, the last of which is the result, and whoever is told can stop it.
     let mut told = Vec::new();
-    let result = reconstruct(&checkpoint, &[inputs], None, &config.sample, &[5, 6], &device, |step| {
+    let sampler = FlowSampler { checkpoint: &checkpoint, config: &config.sample, device: &device };
+    let result = sampler.sample(&[inputs], &[5, 6], |step| {
         told.push((step.index, step.clouds().unwrap()));
         ControlFlow::Continue(())
     });
@@ -188,21 +174,21 @@ fn one_object_is_learned_sampled_and_rendered() {
     assert_eq!(told[19].1, result.unwrap());
     assert_ne!(told[18].1, told[19].1);
     let mut steps = 0;
-    let stopped = reconstruct(&checkpoint, &[inputs], None, &config.sample, &[5], &device, |step| {
+    let stopped = sampler.sample(&[inputs], &[5], |step| {
         steps += 1;
         if step.index == 2 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
     });
     assert!(matches!(stopped, Err(FlowError::Cancelled)) && steps == 3);
 
     // Another batch: two objects (the second sees other views), one seed.
-    let both = reconstruct(&checkpoint, &[inputs, unseen], None, &config.sample, &[5], &device, go).unwrap();
+    let both = sample(&checkpoint, &[inputs, unseen], &config.sample, &[5]);
     let worst = |a: &Cloud, b: &Cloud| a.rows().iter().zip(b.rows()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-    assert_eq!(both.iter().map(Vec::len).collect::<Vec<_>>(), [1, 1]);
-    let off = worst(&both[0][0], &clouds[0]);
+    assert_eq!(both.len(), 2);
+    let off = worst(&both[0], &clouds[0]);
     assert!(off < 1e-2, "the same seed in another batch gives the same sample, up to rounding: off by {off}");
-    let alone = reconstruct(&checkpoint, &[unseen], None, &config.sample, &[5], &device, go).unwrap();
-    assert!(worst(&both[1][0], &alone[0][0]) < 1e-2);
-    assert_ne!(both[0][0], both[1][0]);
+    let alone = sample(&checkpoint, &[unseen], &config.sample, &[5]);
+    assert!(worst(&both[1], &alone[0]) < 1e-2);
+    assert_ne!(both[0], both[1]);
 }
 
 #[test]
@@ -355,9 +341,9 @@ fn another_object_of_the_same_data_agrees_with_its_photos() {
     assert!(others > 1.5 * own, "it is another object: {others} {own}");
 }
 
-/// Training at the start, from a fit to what it should have been, and sampling that stays there.
+/// Training at the start, from a fit to what it should have been, and refinement.
 #[test]
-fn a_fit_is_mended() {
+fn a_fit_is_refined() {
     let place = tempfile::tempdir().unwrap();
     let text = ONE_OBJECT
         .replace("STEPS", "160")
@@ -375,9 +361,8 @@ fn a_fit_is_mended() {
              start = { share = 1.0, time = 0.0, noise = 0.0, hold = 1.0, render = 50.0 }",
         )
         .replace(
-            "steps = 20\n",
-            "steps = 3\nsolver = \"hold\"\ngradient_at = \"estimate\"\nphotometric = 0.0\n\
-             start = { time = 0.0, noise = 0.0, fit = { iterations = 60, gaussians = 64, render_size = 32 } }\n",
+            "[sample]",
+            "[refiner]\npasses = 3\nretokenize_every = 0\ngradient_size = 32\n\n[sample]",
         );
     let config: TrainConfig = toml::from_str(&text).unwrap();
     config.validate().unwrap();
@@ -416,43 +401,35 @@ fn a_fit_is_mended() {
     for (i, view) in object.views.iter().enumerate() {
         if fit.views.contains(&i) { inputs.push(view.clone()) } else { unseen.push(view.clone()) }
     }
-    let mut steps = 0;
-    let fits = [fit.gaussians.clone()];
-    let sample = |seeds: &[u64], config: &SampleConfig, steps: &mut usize| {
-        reconstruct(&checkpoint, &[&inputs], Some(&fits), config, seeds, &device, |step| {
-            assert_eq!(step.t, 0.0);
-            *steps += 1;
-            ControlFlow::Continue(())
-        })
-        .unwrap()
-        .remove(0)
+    let refine = |proposals: &[Cloud], passes, retokenize_every| {
+        let config = &RefinerConfig { passes, retokenize_every, ..config.refiner.clone().unwrap() };
+        let mut steps = 0;
+        let found =
+            Refiner { checkpoint: &checkpoint, config, device: &device }.refine(&[&inputs], proposals, |pass| {
+                assert_eq!((pass.t, pass.index), (0.0, steps));
+                steps += 1;
+                ControlFlow::Continue(())
+            });
+        assert_eq!(steps, passes);
+        found.unwrap()
     };
-    // The colour behind the object is drawn, and all that a seed changes here.
-    let white = SampleConfig { background: freerange_flow::sample::Background::White, ..config.sample.clone() };
-    let clouds = sample(&[5, 6], &white, &mut steps);
-    assert_eq!(steps, 3);
-    assert_eq!(clouds[0], clouds[1], "without noise there is but one sample");
-    let [from, to, found] = [&fit.gaussians, &fit.mended, &clouds[0]].map(|cloud| quality(cloud.rows(), &unseen));
+    let own = fit.gaussians.clone();
+    let found = refine(&[own.clone(), own.clone()], 3, 0);
+    assert_eq!((found.len(), &found[0]), (2, &found[1]), "nothing is random");
+    let [from, to, found] = [&fit.gaussians, &fit.mended, &found[0]].map(|cloud| quality(cloud.rows(), &unseen));
     assert!(
         found > from + 0.4 * (to - from) && to > from + 1.0,
-        "fit {from:.2} dB, mended {found:.2} dB, at best {to:.2} dB"
+        "fit {from:.2} dB, refined {found:.2} dB, at best {to:.2} dB"
     );
-    // Photometric guidance moves what is fed back.
-    let pushed = sample(&[5], &SampleConfig { lambda_pg: 0.05, ..white.clone() }, &mut steps);
-    assert_ne!(pushed[0], clouds[0]);
 
-    // To regroup what is fed back is to begin anew with it in the place of the fit.
-    let config = |steps, regroup| SampleConfig { steps, regroup, ..white.clone() };
-    let mend = |fit: &Cloud, config: &SampleConfig| {
-        let (fits, go) = ([fit.clone()], ControlFlow::Continue(()));
-        reconstruct(&checkpoint, &[&inputs], Some(&fits), config, &[5], &device, |_| go).unwrap().remove(0).remove(0)
-    };
-    let half = mend(&fit.gaussians, &config(2, 0));
-    let [anew, regrouped, straight] =
-        [mend(&half, &config(2, 0)), mend(&fit.gaussians, &config(4, 2)), mend(&fit.gaussians, &config(4, 0))];
-    assert_ne!(tree_slice(&half, 6).unwrap(), half, "mending moves Gaussians past each other");
-    assert_eq!(anew, regrouped);
-    assert_ne!(straight, regrouped);
+    // To group the Gaussians into tokens again is to begin again with them as the proposal.
+    let one = |proposal: &Cloud, passes, every| refine(std::slice::from_ref(proposal), passes, every).remove(0);
+    let half = one(&own, 2, 0);
+    assert_ne!(tree_slice(&half, 6).unwrap(), half, "refinement moves Gaussians past each other");
+    assert_eq!(one(&half, 2, 0), one(&own, 4, 2));
+    assert_ne!(one(&own, 4, 0), one(&own, 4, 2));
+    let none = Refiner { checkpoint: &checkpoint, config: config.refiner.as_ref().unwrap(), device: &device };
+    assert!(none.refine(&[&inputs], &[], go).unwrap_err().to_string().contains("proposals"));
 }
 
 /// What a network says that does not look at its images is the same with and without them: no guidance changes it.
@@ -463,7 +440,7 @@ fn guidance_of_a_network_that_ignores_its_images_changes_nothing() {
     config.model.observation_channels = true;
     config.model.preconditioning = Some([0.5; channel::COUNT]);
     config.sample.gradient_at = freerange_flow::sample::GradientAt::Estimate;
-    config.sample = SampleConfig { steps: 4, lambda_pg: 0.0, ..config.sample };
+    config.sample = FlowConfig { steps: 4, lambda_pg: 0.0, ..config.sample };
     let place = tempfile::tempdir().unwrap();
     // Before the first step the last layer is zero: the network corrects nothing.
     train(&config, place.path(), 0);
@@ -471,14 +448,12 @@ fn guidance_of_a_network_that_ignores_its_images_changes_nothing() {
     let checkpoint = Checkpoint::load(&place.path().join("checkpoint.safetensors"), &device).unwrap();
     let source = Generated { config: config.data.making.object.clone(), depths: config.depths(), seed: 7 };
     let views = source.object(0).unwrap().views;
-    let sample = |cfg_scale: f32| {
-        let config = SampleConfig { cfg_scale, ..config.sample.clone() };
-        let go = ControlFlow::Continue(());
-        reconstruct(&checkpoint, &[&views[..4]], None, &config, &[5], &device, |_| go).unwrap().remove(0).remove(0)
+    let guided = |cfg_scale: f32| {
+        sample(&checkpoint, &[&views[..4]], &FlowConfig { cfg_scale, ..config.sample.clone() }, &[5]).remove(0)
     };
-    let plain = sample(1.0);
+    let plain = guided(1.0);
     for scale in [0.0, 1.5, 3.0] {
-        let difference = sample(scale).rows().iter().zip(plain.rows()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        let difference = guided(scale).rows().iter().zip(plain.rows()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(difference < 1e-3, "s = {scale}: {difference}");
     }
 }

@@ -55,24 +55,46 @@ pub struct JobOptions {
     pub samples: Option<u32>,
     /// Seed of the first; 0 where it is left out. The others follow.
     pub seed: Option<u64>,
-    /// Steps of refinement on the photos; the model's own where it is left out.
-    pub refine: Option<usize>,
-    /// How fine the detail is that refinement looks for; the model's own where it is left out.
-    pub detail: Option<usize>,
-    /// Steps of sampling; the model's own where it is left out.
-    pub steps: Option<usize>,
-    /// Where sampling starts; the model's own way where it is left out.
-    pub start: Option<Start>,
+    /// Preset of quality and time; the server's where it is left out.
+    pub quality: Option<Quality>,
+    /// Optimization steps on the photos; the preset's where it is left out.
+    pub iterations: Option<usize>,
+    /// Whether symmetries are looked for; the preset's where it is left out.
+    pub symmetry: Option<Symmetry>,
+    /// What the reconstruction begins with; the model's own way where it is left out.
+    pub init: Option<Init>,
 }
 
-/// Where sampling starts.
+/// Presets of quality and time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Start {
-    /// A quick fit of the photos.
+pub enum Quality {
+    /// The quickest.
+    Draft,
+    /// What results are reported for.
+    Default,
+    /// More optimization.
+    High,
+}
+
+/// Whether symmetries are looked for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Symmetry {
+    /// Where there is reason to.
+    Auto,
+    /// Never.
+    Off,
+}
+
+/// What a reconstruction begins with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Init {
+    /// Initial fits of the photos.
     Fit,
-    /// Pure noise.
-    Noise,
+    /// Samples from noise.
+    Flow,
 }
 
 impl JobOptions {
@@ -85,9 +107,7 @@ impl JobOptions {
         within("samples", self.samples.map(u64::from), 1, 8)?;
         // Numbers of JavaScript are exact up to here.
         within("seed", self.seed, 0, (1 << 53) - 1)?;
-        within("refine", self.refine.map(|v| v as u64), 0, 5000)?;
-        within("detail", self.detail.map(|v| v as u64), 1, 4)?;
-        within("steps", self.steps.map(|v| v as u64), 1, 200)
+        within("iterations", self.iterations.map(|v| v as u64), 0, 5000)
     }
 
     /// One per sample.
@@ -100,7 +120,7 @@ impl JobOptions {
 pub struct Step<'a> {
     /// One word.
     pub stage: &'static str,
-    /// Which sample, where they are worked on one after the other.
+    /// Which sample is worked on.
     pub sample: usize,
     /// Steps of the stage that are done.
     pub done: usize,
@@ -108,9 +128,9 @@ pub struct Step<'a> {
     pub total: usize,
     /// The loss of a fit.
     pub loss: Option<f64>,
-    /// What the Gaussians are by now, in the frame of the views, each with the sample that it is of; nothing where there are none yet.
-    /// May cost something: it is called for those steps only that are shown.
-    pub estimate: &'a dyn Fn() -> Result<Vec<(usize, Cloud)>, String>,
+    /// The Gaussians of that sample by now, in the frame of the views; nothing where there are none yet. May cost something: it is
+    /// called for those steps only that are shown.
+    pub preview: &'a dyn Fn() -> Result<Option<Cloud>, String>,
 }
 
 /// What came of a run.

@@ -25,6 +25,6 @@ mod server;
 mod upload;
 
 pub use config::{Example, Limits, ServeConfig};
-pub use engine::{Engine, EngineError, JobOptions, Outcome, Scene, Start, Step};
+pub use engine::{Engine, EngineError, Init, JobOptions, Outcome, Quality, Scene, Step, Symmetry};
 pub use error::{Refusal, ServeError};
 pub use server::{Server, Stopper};

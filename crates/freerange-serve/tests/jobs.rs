@@ -21,7 +21,7 @@ use image::{Rgba, RgbaImage};
 fn the_example_becomes_gaussians_while_one_watches() {
     let engine = Arc::new(Fake { pause: Duration::from_millis(60), steps: 8, ..Fake::default() });
     let server = Running::plain(engine.clone());
-    let id = server.example(r#"{"samples": 2, "seed": 3, "detail": 2}"#);
+    let id = server.example(r#"{"samples": 2, "seed": 3, "iterations": 200}"#);
     // What the stream of events tells, and the Gaussians that it points at.
     let mut stream = TcpStream::connect(server.address).unwrap();
     std::io::Write::write_all(
@@ -42,7 +42,7 @@ fn the_example_becomes_gaussians_while_one_watches() {
             let status: serde_json::Value = serde_json::from_str(data).unwrap();
             states.push(status["state"].as_str().unwrap().to_owned());
             if let Some(number) = status["estimate"]["number"].as_u64() {
-                assert_eq!(status["estimate"]["parts"][1]["gaussians"], 40);
+                assert_eq!(status["estimate"]["parts"][0]["gaussians"], 40);
                 let reply = server.get(&format!("/jobs/{id}/estimates/{number}/1"));
                 assert!(reply.status == 200 && reply.body.len() == 40 * 56, "{}", reply.text());
                 clouds.insert(reply.body);
@@ -60,7 +60,7 @@ fn the_example_becomes_gaussians_while_one_watches() {
     assert_eq!(job["understood"]["views"].as_array().unwrap().len(), 4);
     let options = engine.seen.lock().unwrap()[0].2;
     assert_eq!((options.samples, options.seed), (Some(2), Some(3)));
-    assert_eq!((options.refine, options.detail), (None, Some(2)));
+    assert_eq!((options.iterations, options.init), (Some(200), None));
     let expected = Fake::cloud(4, 8);
     // Colours are rounded in files.
     let alike = |rows: &[f32]| rows.iter().zip(expected.rows()).all(|(a, b)| (a - b).abs() < 1e-6);

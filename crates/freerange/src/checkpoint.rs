@@ -7,10 +7,7 @@ use std::{
 
 use burn::tensor::Device;
 use freerange_core::{IoError, sha256};
-use freerange_flow::{
-    sample::{SETTINGS_SCHEMA, SampleConfig},
-    trainer::EncoderWeights,
-};
+use freerange_flow::trainer::EncoderWeights;
 use freerange_model::{Checkpoint, Dinov2, EncoderConfig, Header};
 
 use crate::{Error, machine::weights_folder};
@@ -55,33 +52,6 @@ pub fn checkpoint_sha256(path: Option<&Path>) -> Result<String, Error> {
 pub fn checkpoint_header(path: Option<&Path>) -> Result<Header, Error> {
     let (bytes, name) = read(path)?;
     Ok(Checkpoint::header(&bytes, name)?)
-}
-
-/// How a checkpoint with this provenance is sampled from by default.
-///
-/// # Errors
-/// If what it says of that cannot be used.
-pub fn sampling(provenance: &serde_json::Value) -> Result<SampleConfig, Error> {
-    // Without a number, fields that equal a default are left out; all defaults are still those of then.
-    let schema = provenance.get("settings_schema");
-    if schema.is_some_and(|number| number.as_u64().is_none_or(|number| number > SETTINGS_SCHEMA.into())) {
-        let expected = format!("a number up to {SETTINGS_SCHEMA}: a later program has made the checkpoint");
-        let found = schema.map_or_else(String::new, ToString::to_string);
-        return Err(Error::input("checkpoint: field `settings_schema` of the metadata", expected, found));
-    }
-    let sample: SampleConfig = match provenance.get("sample") {
-        Some(value) => serde_json::from_value(value.clone())
-            .map_err(|e| Error::input("checkpoint: field `sample` of the metadata", "settings of sampling", e))?,
-        None => SampleConfig::default(),
-    };
-    sample.validate()?;
-    Ok(sample)
-}
-
-/// Most views that a model with this provenance has seen at once in training; the paper's four where it does not say.
-pub fn network_views(provenance: &serde_json::Value) -> usize {
-    let most = provenance.pointer("/configuration/loss/input_views/1");
-    most.and_then(serde_json::Value::as_u64).and_then(|n| n.try_into().ok()).filter(|n| *n > 0).unwrap_or(4)
 }
 
 /// Reads this checkpoint, or the shipped one, with its encoder's weights if those are published ones.
@@ -221,23 +191,6 @@ mod tests {
         assert_eq!(hub_name("some/folder").unwrap(), None);
         for bad in ["hf:", "hf:a", "hf:a/", "hf:/b", "hf:a/b/c", "hf:../b", "hf:a/..", "hf:a/b c"] {
             assert!(hub_name(bad).unwrap_err().to_string().contains(bad), "{bad}");
-        }
-    }
-
-    /// The shipped checkpoint was made before records held every field.
-    #[test]
-    fn settings_without_a_number_are_those_of_then() {
-        let header = checkpoint_header(None).unwrap();
-        assert!(header.provenance.get("settings_schema").is_none());
-        let sample = sampling(&header.provenance).unwrap();
-        assert_eq!((sample.steps, sample.ensemble, sample.refine, sample.detail, sample.polish), (12, 4, 500, 2, 0));
-        let of = |schema: serde_json::Value| {
-            sampling(&serde_json::json!({ "settings_schema": schema, "sample": sample })).map_err(|e| e.to_string())
-        };
-        assert_eq!(of(SETTINGS_SCHEMA.into()).unwrap(), sample);
-        for later in [(SETTINGS_SCHEMA + 1).into(), "1".into(), serde_json::Value::Null] {
-            let error = of(later).unwrap_err();
-            assert!(error.contains("settings_schema"), "{error}");
         }
     }
 

@@ -33,7 +33,10 @@ pub enum Error {
     /// The scene, its frame, or the choice of views.
     #[error(transparent)]
     Camera(#[from] freerange_camera::CameraError),
-    /// The quick fit or the refinement.
+    /// A scene's cameras, photos or masks.
+    #[error(transparent)]
+    Scene(#[from] freerange_scene::SceneError),
+    /// An initial fit or the optimization.
     #[error(transparent)]
     Fit(#[from] freerange_fit::FitError),
     /// Sampling.

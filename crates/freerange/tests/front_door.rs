@@ -3,8 +3,8 @@
 use std::{ops::ControlFlow, path::Path};
 
 use freerange::{
-    Camera, Device, Error, Options, Progress, Reconstructor, SampleConfig, Scene, Similarity, Stage, View, score,
-    to_canonical,
+    Camera, Choices, Cloud, Detect, Device, Error, Init, Options, Progress, Quality, Reconstructor, RefinerConfig,
+    Scene, Similarity, Stage, View, score, to_canonical,
 };
 use freerange_camera::{FrameConfig, Window};
 use glam::{DQuat, DVec3};
@@ -13,20 +13,29 @@ fn model() -> Reconstructor {
     Reconstructor::shipped(&Device::flex()).unwrap()
 }
 
-fn bowl() -> Vec<View> {
-    Scene::load(Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/bowl"))).unwrap().inputs
+fn scene() -> Scene {
+    Scene::open(Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/bowl"))).unwrap()
 }
 
-/// Quick to run, with every stage.
+fn bowl() -> Vec<View> {
+    scene().loaded.views
+}
+
+/// Quick to run, with every stage but symmetry.
 fn short(model: &Reconstructor) -> Options {
     let mut options = model.options().unwrap();
-    options.sample.start.as_mut().expect("the shipped model starts from a fit").fit.iterations = 20;
-    options.sample.steps = 3;
+    let pipeline = &mut options.pipeline;
+    pipeline.propose.fit.iterations = 20;
+    pipeline.propose.count = 1;
+    refiner(&mut options).passes = 3;
     options.seeds = vec![4, 5];
-    options.sample.refine = 4;
-    options.sample.ensemble = 1;
-    (options.sample.mirror, options.sample.turn) = (0.0, 0.0);
+    options.pipeline.optimize.iterations = 4;
+    options.pipeline.symmetry.detect = Detect::Off;
     options
+}
+
+fn refiner(options: &mut Options) -> &mut RefinerConfig {
+    options.pipeline.refine.as_mut().expect("the shipped model refines initial fits")
 }
 
 fn go(_: &Progress<'_>) -> ControlFlow<()> {
@@ -39,117 +48,98 @@ fn elsewhere(views: &[View], to: &Similarity) -> Vec<View> {
 }
 
 #[test]
-fn every_step_is_told_and_the_last_estimate_is_the_result_in_the_users_frame() {
+fn every_step_is_reported_and_the_last_preview_is_the_result_in_the_users_frame() {
     let model = model();
     let mut options = short(&model);
     // Away from the canonical frame, where nothing that stays in it would agree with the cameras.
     let to = Similarity { scale: 3.0, rotation: DQuat::from_rotation_z(0.4), translation: DVec3::new(5.0, -2.0, 1.0) };
     let views = elsewhere(&bowl(), &to);
-    let mut told = Vec::new();
-    let mut estimates = Vec::new();
+    let (mut reports, mut previews) = (Vec::new(), Vec::new());
     let result = model
         .run(&views, &options, &mut |p| {
-            told.push((p.stage, p.sample, p.done, p.total));
-            let estimate = p.estimate().unwrap();
-            // Of the fits (what moves the frame, and one for each sample) the first is shown.
-            assert_eq!(estimate.is_some(), p.done > 0 && (p.stage != Stage::Fit || p.done <= 20));
-            assert_eq!(p.loss.is_some(), matches!(p.stage, Stage::Fit | Stage::Refine) && p.done > 0);
-            estimates.extend(estimate.map(|clouds| (p.stage, p.sample, clouds)));
+            reports.push((p.stage, p.sample, p.done, p.total));
+            let preview = p.preview().unwrap();
+            let begins = p.done == 0;
+            assert_eq!(preview.is_some(), !begins && p.total > 1);
+            assert_eq!(p.loss.is_some(), preview.is_some() && p.stage != Stage::Refine);
+            previews.extend(preview.map(|cloud| (p.stage, p.sample, cloud)));
             ControlFlow::Continue(())
         })
         .unwrap();
     let steps = |stage, sample, total: usize| (0..=total).map(move |done| (stage, sample, done, total));
-    let expected: Vec<_> = [(Stage::Frame, 0, 0, 1)]
-        .into_iter()
-        .chain(steps(Stage::Fit, 0, 60))
-        .chain(steps(Stage::Sample, 0, 3))
-        .chain(steps(Stage::Refine, 0, 4))
-        .chain(steps(Stage::Refine, 1, 4))
-        .collect();
-    assert_eq!(told, expected);
-    assert_eq!(
-        result.seconds.iter().map(|s| s.0).collect::<Vec<_>>(),
-        [Stage::Frame, Stage::Fit, Stage::Sample, Stage::Refine]
-    );
-    let unrefined: Vec<_> = result.samples.iter().map(|s| s.unrefined.clone().unwrap()).collect();
+    // The fit that finds the object is of seed 0: each sample has one of its own.
+    let mut expected: Vec<_> = std::iter::once((Stage::Canonicalize, 0, 0, 1)).collect();
+    expected.extend(steps(Stage::Canonicalize, 0, 20));
+    for sample in 0..2 {
+        expected.extend(steps(Stage::Propose, sample, 20));
+        expected.extend(steps(Stage::Refine, sample, 3));
+        expected.extend(steps(Stage::Optimize, sample, 4));
+    }
+    assert_eq!(reports, expected);
+    let stages: Vec<Stage> = result.seconds.iter().map(|s| s.0).collect();
+    assert_eq!(stages, [Stage::Canonicalize, Stage::Symmetry, Stage::Propose, Stage::Refine, Stage::Optimize]);
     let of = |stage, sample| {
-        let of = estimates.iter().filter(move |e| (e.0, e.1) == (stage, sample));
-        of.map(|e| e.2.clone()).collect::<Vec<_>>()
+        let of = previews.iter().filter(move |e| (e.0, e.1) == (stage, sample));
+        of.map(|e| e.2.clone()).collect::<Vec<Cloud>>()
     };
-    let sampled = of(Stage::Sample, 0);
-    assert!(sampled.len() == 3 && sampled[2] == unrefined && sampled[1] != unrefined);
-    // Of fits and refinements the states: the last one of a refinement is the result.
-    let fitted = of(Stage::Fit, 0);
-    assert!(fitted.len() == 20 && fitted.windows(2).all(|pair| pair[0].len() == 1 && pair[0] != pair[1]));
-    let before = score(&fitted[0][0], &views).unwrap().unwrap().psnr;
-    let after = score(&fitted[19][0], &views).unwrap().unwrap().psnr;
+    let fitted = of(Stage::Propose, 0);
+    assert!(fitted.len() == 20 && fitted.windows(2).all(|pair| pair[0] != pair[1]));
+    let psnr = |cloud: &Cloud| score(cloud, &views).unwrap().unwrap().psnr;
+    let (before, after) = (psnr(&fitted[0]), psnr(&fitted[19]));
     assert!(before > 10.0 && after > before, "in the frame of the cameras, and better: {before} dB, {after} dB");
     for (i, sample) in result.samples.iter().enumerate() {
-        let refined = of(Stage::Refine, i);
-        assert_eq!(refined.len(), 4);
-        assert!(refined[3][0].len() == sample.gaussians.len() && refined[0] != refined[3]);
+        let (refined, optimized) = (of(Stage::Refine, i), of(Stage::Optimize, i));
+        let before = sample.before_optimization.as_ref().unwrap();
+        assert!(refined.len() == 3 && &refined[2] == before && &refined[1] != before);
+        assert!(optimized.len() == 4 && optimized[0] != optimized[3]);
         // But for the labels of axes, which are made canonical at the end.
-        let means = |cloud: &freerange::Cloud| (0..cloud.len()).map(|k| cloud.mean(k)).collect::<Vec<_>>();
-        assert_eq!(means(&refined[3][0]), means(&sample.gaussians));
-    }
-    assert_eq!(result.samples.iter().map(|s| s.seed).collect::<Vec<_>>(), [4, 5]);
-    assert_ne!(unrefined[0], unrefined[1]);
-    // In the frame of the cameras: what is seen there is the bowl.
-    for sample in &result.samples {
-        let found = score(&sample.gaussians, &views).unwrap().unwrap().psnr;
+        let means = |cloud: &Cloud| (0..cloud.len()).map(|k| cloud.mean(k)).collect::<Vec<_>>();
+        assert_eq!(means(&optimized[3]), means(&sample.gaussians));
+        let found = psnr(&sample.gaussians);
         assert!(found > 18.0, "{found} dB");
     }
+    assert_eq!(result.samples.iter().map(|s| s.seed).collect::<Vec<_>>(), [4, 5]);
+    assert_ne!(result.samples[0].gaussians, result.samples[1].gaussians);
 
-    // The same without anyone who looks.
-    assert_eq!(model.run(&views, &options, &mut go).unwrap().samples[1].gaussians, result.samples[1].gaussians);
-    options.sample.refine = 0;
-    let plain = model.run(&views, &options, &mut go).unwrap();
-    assert!(plain.samples.iter().all(|s| s.unrefined.is_none()));
-    assert_eq!(plain.samples[0].gaussians, unrefined[0]);
-    // But for rounding, a sample is the same whatever is drawn beside it: so is its fit, and the frame.
+    // The same without anyone who looks, and whatever is drawn beside it.
     options.seeds = vec![5];
     let alone = model.run(&views, &options, &mut go).unwrap();
-    assert_eq!(alone.canonical_from_user, plain.canonical_from_user);
-    let apart = |a: &freerange::Cloud, b: &freerange::Cloud| {
-        (0..a.len()).map(|k| a.mean(k).distance(b.mean(k))).fold(0.0, f64::max)
-    };
-    let [same, other] = [&unrefined[1], &unrefined[0]].map(|cloud| apart(&alone.samples[0].gaussians, cloud));
-    assert!(same < 0.1 * other, "{same} {other}");
+    assert_eq!(alone.samples[0].gaussians, result.samples[1].gaussians);
+    assert_eq!(alone.canonical_from_user, result.canonical_from_user);
+    options.pipeline.optimize.iterations = 0;
+    let plain = model.run(&views, &options, &mut go).unwrap();
+    assert!(plain.samples[0].before_optimization.is_none());
+    assert_eq!(Some(&plain.samples[0].gaussians), alone.samples[0].before_optimization.as_ref());
 }
 
-/// The first sample is what it is without the other members, what comes of it is not.
+/// The first proposal is what it is without the others; what comes of them together is not.
 #[test]
-fn an_ensemble_is_refined_together() {
+fn proposals_are_optimized_together() {
     let model = model();
     let views = bowl();
     let mut options = short(&model);
     options.seeds.truncate(1);
-    let (mut own, mut told, mut estimates) = (Vec::new(), Vec::new(), Vec::new());
-    let alone = model
-        .run(&views, &options, &mut |p| {
-            own.extend(p.estimate().unwrap().map(|clouds| (p.stage, clouds)));
+    let run = |options: &Options| {
+        let (mut reports, mut previews) = (Vec::new(), Vec::new());
+        let made = model.run(&views, options, &mut |p| {
+            reports.push((p.stage, p.done, p.total));
+            previews.extend(p.preview().unwrap().map(|cloud| (p.stage, cloud)));
             ControlFlow::Continue(())
-        })
-        .unwrap();
-    options.sample.ensemble = 3;
-    let together = model
-        .run(&views, &options, &mut |p| {
-            told.push((p.stage, p.done, p.total));
-            estimates.extend(p.estimate().unwrap().map(|clouds| (p.stage, clouds)));
-            ControlFlow::Continue(())
-        })
-        .unwrap();
+        });
+        (made.unwrap(), reports, previews)
+    };
+    let (alone, _, own) = run(&options);
+    options.pipeline.propose.count = 3;
+    let (together, reports, previews) = run(&options);
     let steps = |stage, total: usize| (0..=total).map(move |done| (stage, done, total));
-    let expected: Vec<_> = steps(Stage::Fit, 60).chain(steps(Stage::Sample, 9)).collect();
-    assert_eq!(told[1..1 + expected.len()], expected);
-    // Of the members, which are worked on side by side, the first is shown, and what is shown of it is what it is alone.
-    for (stage, count) in [(Stage::Fit, 20), (Stage::Sample, 3)] {
-        let of = |all: &[(Stage, Vec<freerange::Cloud>)]| {
-            all.iter().filter(|e| e.0 == stage).map(|e| e.1.clone()).collect::<Vec<_>>()
-        };
-        assert!(of(&estimates).len() == count && of(&estimates) == of(&own), "{stage}");
+    let expected: Vec<_> = steps(Stage::Propose, 60).chain(steps(Stage::Refine, 9)).collect();
+    assert_eq!(reports[1..1 + expected.len()], expected);
+    // Proposals are worked on beside each other; previews show the first, which is what it is alone.
+    for (stage, count) in [(Stage::Propose, 20), (Stage::Refine, 3)] {
+        let of = |all: &[(Stage, Cloud)]| all.iter().filter(|e| e.0 == stage).map(|e| e.1.clone()).collect::<Vec<_>>();
+        assert!(of(&previews).len() == count && of(&previews) == of(&own), "{stage}");
     }
-    assert_eq!(alone.samples[0].unrefined, together.samples[0].unrefined);
+    assert_eq!(alone.samples[0].before_optimization, together.samples[0].before_optimization);
     // However many threads there are, and within a pool, where the caller is one of them.
     let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     let same = one.install(|| model.run(&views, &options, &mut go)).unwrap();
@@ -158,43 +148,65 @@ fn an_ensemble_is_refined_together() {
     assert_eq!(alone.canonical_from_user, together.canonical_from_user);
 }
 
-/// A bowl is its own mirror image: mirrored photos are shown, and the user is told so.
+/// A bowl has a mirror plane and an axis: both add to the targets, and the user hears of it.
 #[test]
-fn mirrored_photos_are_further_views() {
+fn symmetries_add_targets() {
     let model = model();
     let views = bowl();
     let mut options = short(&model);
     options.seeds.truncate(1);
-    let run = |options: &freerange::Options| {
-        let mut told = Vec::new();
-        let made = model.run(&views, options, &mut |p| {
-            told.push((p.stage, p.done, p.total));
+    options.pipeline.optimize.iterations = 0;
+    options.pipeline.symmetry.detect = Detect::Auto;
+    let run = |reflection, revolution, iterations| {
+        let mut options = options.clone();
+        options.pipeline.optimize.iterations = iterations;
+        let symmetry = &mut options.pipeline.symmetry;
+        (symmetry.reflection_threshold, symmetry.revolution_threshold) = (reflection, revolution);
+        let mut reports = Vec::new();
+        let made = model.run(&views, &options, &mut |p| {
+            reports.push((p.stage, p.done, p.total));
             ControlFlow::Continue(())
         });
-        (made.unwrap(), told)
+        let made = made.unwrap();
+        let noted = ["symmetric about the plane", "solid of revolution"];
+        let noted = noted.map(|what| made.notes.iter().any(|n| n.contains(what)));
+        assert!(reports.windows(2).all(|pair| pair[0].0 <= pair[1].0), "stages come in their order");
+        reports.retain(|r| r.0 == Stage::Symmetry);
+        (noted, made, reports)
     };
-    let (without, _) = run(&options);
-    let noted = |made: &freerange::Reconstruction| made.notes.iter().any(|note| note.contains("mirror image"));
-    options.sample.mirror = 1e-6;
-    let (contradicted, _) = run(&options);
-    options.sample.mirror = 100.0;
-    let (with, told) = run(&options);
-    assert_eq!([&without, &contradicted, &with].map(noted), [false, false, true]);
-    assert_eq!(with.shown, without.shown);
-    assert_ne!(with.samples[0].gaussians, without.samples[0].gaussians);
-    let steps: Vec<_> = told.iter().filter(|t| t.0 == Stage::Mirror).collect();
-    let (first, last) = (steps[0], steps[steps.len() - 1]);
-    assert!(
-        first.1 == 0 && last.1 == last.2 && steps.windows(2).all(|pair| pair[0].1 <= pair[1].1),
-        "{first:?} {last:?}"
-    );
-    assert!(told.windows(2).all(|pair| pair[0].0 <= pair[1].0), "stages come in their order");
+    let (noted, without, reports) = run(0.0, 0.0, 0);
+    assert!(noted == [false, false] && reports.iter().all(|r| r.2 == 0));
+    let (noted, contradicted, _) = run(1e-6, 1e-6, 0);
+    assert_eq!((noted, &contradicted.samples[0].gaussians), ([false, false], &without.samples[0].gaussians));
+    let (noted, mirrored, _) = run(100.0, 0.0, 0);
+    assert_eq!((noted, &mirrored.network_views), ([true, false], &without.network_views));
+    let (noted, rotated, _) = run(0.0, 100.0, 0);
+    assert_eq!(noted, [false, true]);
+    let (noted, both, reports) = run(100.0, 100.0, 0);
+    assert_eq!(noted, [true, true]);
+    let made = [&without, &mirrored, &rotated, &both].map(|made| &made.samples[0].gaussians);
+    assert!((0..4).all(|i| (0..i).all(|j| made[i] != made[j])), "each adds something else");
+    let (first, last) = (reports[0], reports[reports.len() - 1]);
+    assert!(first.1 == 0 && last.1 == last.2, "{first:?} {last:?}");
+    assert!(reports.windows(2).all(|pair| pair[0].1 <= pair[1].1 && pair[0].2 == pair[1].2), "one stage");
+    // The optimization agrees with them as well.
+    let [plain, held] = [0.0, 100.0].map(|revolution| run(0.0, revolution, 3).1.samples.remove(0));
+    assert_ne!(plain.gaussians, held.gaussians);
 
+    // What was judged with four photos is not applied to more.
+    let scene = scene();
+    let many = [scene.views(), scene.further()].concat();
+    options.pipeline.symmetry.reflection_threshold = 100.0;
+    let made = model.run(&many, &options, &mut |p| {
+        assert_ne!(p.stage, Stage::Symmetry);
+        ControlFlow::Continue(())
+    });
+    assert!(made.unwrap().notes.iter().any(|n| n.contains("no symmetry is looked for")));
     for last in [0, 5] {
         let mut after = 0;
         let stopped = model.run(&views, &options, &mut |p| {
             after += usize::from(after > 0);
-            if (p.stage, p.done) == (Stage::Mirror, last) {
+            if (p.stage, p.done) == (Stage::Symmetry, last) {
                 after = 1;
             }
             if after > 0 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
@@ -203,102 +215,59 @@ fn mirrored_photos_are_further_views() {
     }
 }
 
-/// A bowl may be turned about its axis: turned outlines are fitted to, and the user is told so, in one stage with mirrored photos.
+/// Samples of the flow take the place of fits: everything after them is the same.
 #[test]
-fn turned_outlines_are_fitted_to() {
-    let model = model();
-    let views = bowl();
+fn samples_of_the_flow_are_proposals_too() {
+    let (model, views) = (model(), bowl());
     let mut options = short(&model);
-    options.seeds.truncate(1);
-    let run = |mirror, turn, refine| {
-        let mut options = options.clone();
-        (options.sample.mirror, options.sample.turn, options.sample.refine) = (mirror, turn, refine);
-        let mut told = Vec::new();
-        let made = model.run(&views, &options, &mut |p| {
-            told.push((p.stage, p.done, p.total));
+    // Rough samples, and a few of them.
+    options.seeds = vec![4, 5, 6];
+    options.pipeline.propose.init = Init::Flow;
+    options.pipeline.propose.flow.steps = 2;
+    options.pipeline.optimize.iterations = 0;
+    let mut reports = Vec::new();
+    let quality = |options: &Options, reports: &mut Vec<_>| {
+        let made = model.run(&views, options, &mut |p| {
+            reports.push((p.stage, p.sample, p.done, p.total));
             ControlFlow::Continue(())
         });
         let made = made.unwrap();
-        let noted = ["mirror image", "keep its outlines"].map(|what| made.notes.iter().any(|n| n.contains(what)));
-        told.retain(|t| t.0 == Stage::Mirror);
-        (noted, made, told)
-    };
-    let (noted, without, told) = run(0.0, 0.0, 0);
-    assert!(noted == [false, false] && told.is_empty());
-    let (noted, contradicted, _) = run(0.0, 1e-6, 0);
-    assert_eq!((noted, &contradicted.samples[0].gaussians), ([false, false], &without.samples[0].gaussians));
-    let (noted, turned, _) = run(0.0, 100.0, 0);
-    assert_eq!(noted, [false, true]);
-    assert_ne!(turned.samples[0].gaussians, without.samples[0].gaussians);
-    let (noted, both, told) = run(100.0, 100.0, 0);
-    assert_eq!(noted, [true, true]);
-    assert_ne!(both.samples[0].gaussians, turned.samples[0].gaussians);
-    let (first, last) = (told[0], told[told.len() - 1]);
-    assert!(first.1 == 0 && last.1 == last.2, "{first:?} {last:?}");
-    assert!(told.windows(2).all(|pair| pair[0].1 <= pair[1].1 && pair[0].2 == pair[1].2), "one stage");
-    // Refinement is held to them as well.
-    let [plain, held] = [0.0, 100.0].map(|turn| run(0.0, turn, 3).1.samples.remove(0));
-    assert_ne!(plain.gaussians, held.gaussians);
-}
-
-/// From pure noise; what is mended or polished starts from that sample and stays near it.
-#[test]
-fn a_sample_from_noise_is_mended() {
-    let model = model();
-    let views = bowl();
-    let mut options = short(&model);
-    // Rough samples, and a few of them: single ones differ by as much as mending is worth.
-    options.seeds = vec![4, 5, 6];
-    options.sample = SampleConfig { steps: 1, polish: 0, mend: 0, refine: 0, ..options.sample.without_start() };
-    let quality = |options: &Options| {
-        let made = model.run(&views, options, &mut go).unwrap();
         let scores = made.samples.iter().map(|s| score(&s.gaussians, &views).unwrap().unwrap().psnr);
         scores.sum::<f64>() / made.samples.len() as f64
     };
-    let before = quality(&options);
-    options.sample.mend = 3;
-    let after = quality(&options);
-    assert!(after > before + 0.5, "{before} dB, mended {after} dB");
-    options.sample.mend = 0;
-    options.sample.polish = 60;
-    let after = quality(&options);
-    assert!(after > before + 1.0, "{before} dB, polished {after} dB");
+    refiner(&mut options).passes = 1;
+    let before = quality(&options, &mut reports);
+    assert!(reports.contains(&(Stage::Propose, 2, 2, 2)) && reports.contains(&(Stage::Refine, 2, 1, 1)));
+    refiner(&mut options).passes = 6;
+    let after = quality(&options, &mut reports);
+    assert!(after > before, "{before} dB, more passes of the network {after} dB");
+    options.pipeline.optimize.iterations = 60;
+    let optimized = quality(&options, &mut reports);
+    assert!(optimized > after + 0.4, "{after} dB, optimized {optimized} dB");
 }
 
-/// Polishing and mending take longer than sampling does: they are told of, and can be stopped, too.
 #[test]
-fn all_that_is_done_from_noise_is_told() {
-    let (model, views) = (model(), bowl());
-    let mut options = short(&model);
-    options.sample = options.sample.without_start();
-    options.sample =
-        SampleConfig { steps: 2, polish: 5, mend: 2, ensemble: 2, refine: 1, photometric_repeats: 1, ..options.sample };
-    let mut told = Vec::new();
-    model
-        .run(&views, &options, &mut |p| {
-            if p.stage == Stage::Sample {
-                let estimates = p.estimate().unwrap().map_or(0, |clouds| clouds.len());
-                told.push((p.done, p.total, p.loss.is_some(), estimates));
-            }
-            ControlFlow::Continue(())
-        })
-        .unwrap();
-    // Of each member: the network's steps, with estimates of both samples, then two samples polished, then mended. Members are worked on side by
-    // side: of the second, whose estimates nobody is shown, something may come anywhere.
-    let total = 2 * (2 + 2 * 5 + 2 * 2);
-    assert!(told.iter().map(|t| (t.0, t.1)).eq((0..=total).map(|done| (done, total))), "{told:?}");
-    assert_eq!(told.iter().filter(|t| t.2).count(), 2 * 2 * 5);
-    let shown: Vec<usize> = told.iter().map(|t| t.3).filter(|count| *count > 0).collect();
-    assert_eq!(shown, [2, 2]);
-
-    for last in [5, 14] {
-        let mut reached = 0;
-        let stopped = model.run(&views, &options, &mut |p| {
-            reached = if p.stage == Stage::Sample { p.done } else { 0 };
-            if reached == last { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
-        });
-        assert!(matches!(stopped, Err(Error::Cancelled)) && reached == last, "{last}: {reached}");
-    }
+fn choices_are_presets_and_fields() {
+    let model = model();
+    let of = |choices: Choices| model.options_of(&choices).map(|o| o.pipeline).map_err(|e| e.to_string());
+    let default = of(Choices::default()).unwrap();
+    assert_eq!((default.propose.count, default.optimize.iterations, default.network_views), (4, 500, 6));
+    assert_eq!((default.propose.fit.gaussians, default.optimize.max_gaussians()), (2048, 16_384));
+    let draft = of(Choices { quality: Quality::Draft, ..Choices::default() }).unwrap();
+    assert!(draft.propose.count == 1 && draft.symmetry.detect == Detect::Off && draft.optimize.iterations < 500);
+    let plain = of(Choices { iterations: Some(0), ..Choices::default() }).unwrap();
+    assert_eq!((plain.optimize.iterations, plain.propose.count), (0, 1));
+    let set = |key: &str, value: &str| of(Choices { set: vec![(key.into(), value.into())], ..Choices::default() });
+    assert_eq!(set("refine.passes", "5").unwrap().refine.unwrap().passes, 5);
+    assert_eq!(set("propose.init", "flow").unwrap().propose.init, Init::Flow);
+    assert_eq!(set("propose.flow.lod_depth", "9").unwrap().propose.flow.lod_depth, Some(9));
+    let unknown = set("refine.pases", "5").unwrap_err();
+    assert!(unknown.contains("refine.pases") && unknown.contains("refine.passes"), "{unknown}");
+    assert!(set("refine.passes", "many").unwrap_err().contains("--set refine.passes"));
+    assert!(set("refine", "5").unwrap_err().contains("refine.passes"), "no field of its own");
+    // Every field is in a record, and read again.
+    let record = serde_json::to_value(&default).unwrap();
+    assert_eq!(serde_json::from_value::<freerange::PipelineConfig>(record).unwrap(), default);
 }
 
 #[test]
@@ -306,7 +275,7 @@ fn it_stops_where_it_is_told_to() {
     let (model, views) = (model(), bowl());
     let options = short(&model);
     for (stage, done) in
-        [(Stage::Frame, 0), (Stage::Fit, 2), (Stage::Sample, 0), (Stage::Sample, 1), (Stage::Refine, 1)]
+        [(Stage::Canonicalize, 0), (Stage::Propose, 2), (Stage::Refine, 0), (Stage::Refine, 1), (Stage::Optimize, 1)]
     {
         let mut after = 0;
         let stopped = model.run(&views, &options, &mut |p| {
@@ -343,12 +312,14 @@ fn what_cannot_be_used_is_named() {
         f(&mut options);
         options
     };
-    refused(&views, &with(&|o| o.sample.steps = 0), &["sample.steps"]);
-    refused(
-        &views,
-        &with(&|o| (o.without_network, o.sample) = (true, o.sample.clone().without_start())),
-        &["sample.start"],
-    );
+    refused(&views, &with(&|o| o.pipeline.propose.flow.steps = 0), &["propose.flow.steps"]);
+    refused(&views, &with(&|o| refiner(o).passes = 0), &["refine.passes"]);
+    refused(&views, &with(&|o| o.pipeline.optimize.iterations = 0), &["propose.count", "optimization"]);
+    refused(&views, &with(&|o| o.pipeline.optimize.max_resolution = 300), &["optimize.max_resolution", "256"]);
+    refused(&views, &with(&|o| o.pipeline.network_views = 0), &["network_views"]);
+    refused(&views, &with(&|o| o.pipeline.refine = None), &["propose.init"]);
+    let flow = |o: &mut Options| (o.without_network, o.pipeline.propose.init) = (true, Init::Flow);
+    refused(&views, &with(&flow), &["propose.init"]);
     let alone = model.run(&views[..1], &options, &mut go).unwrap_err().to_string();
     assert!(alone.contains("at least 2 views"), "{alone}");
     assert!(matches!(model.run(&views[..0], &options, &mut go), Err(Error::Camera(_))));
@@ -385,46 +356,42 @@ fn photos_of_any_shape_and_size_are_seen_undistorted() {
     assert_eq!(windows.iter().map(Option::is_some).collect::<Vec<_>>(), [true, true, false, false]);
     let square = |(v, w): (&View, &Option<Window>)| w.map_or_else(|| v.clone(), |w| w.cut(v).into_owned());
     let squares: Vec<View> = photos.iter().zip(&windows).map(square).collect();
-    let mut options = model.options().unwrap();
-    options.sample =
-        SampleConfig { steps: 4, mirror: 0.0, turn: 0.0, polish: 0, refine: 0, ..options.sample.without_start() };
+    let mut options = short(&model);
+    options.seeds.truncate(1);
+    options.pipeline.optimize.iterations = 0;
     let run = |views: &[View], options: &Options| model.run(views, options, &mut go).unwrap().samples.remove(0);
     // What the network and its guidance see of a photo is what a square camera would have seen.
     assert_eq!(run(&photos, &options).gaussians, run(&squares, &options).gaussians);
-    // Fit, sampling and refinement take them as they are, and the bowl is where the cameras saw it.
-    let mut options = short(&model);
-    options.sample.refine = 40;
+    // The optimization takes them as they are, and the bowl is where the cameras saw it.
+    options.pipeline.optimize.iterations = 40;
     let sample = run(&photos, &options);
     let of = |cloud| score(cloud, &bowl).unwrap().unwrap().psnr;
-    let (before, after) = (of(sample.unrefined.as_ref().unwrap()), of(&sample.gaussians));
-    assert!(before > 18.0 && after > before, "{before} dB, refined {after} dB");
+    let (before, after) = (of(sample.before_optimization.as_ref().unwrap()), of(&sample.gaussians));
+    assert!(before > 18.0 && after > before, "{before} dB, optimized {after} dB");
 }
 
 #[test]
-fn the_model_is_shown_as_many_views_as_it_knows() {
+fn the_network_sees_as_many_views_as_it_knows() {
     let model = model();
-    assert_eq!(model.views(), 6, "the shipped checkpoint learned from two to six");
-    let scene = Scene::load(Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/bowl"))).unwrap();
-    let mut views = scene.inputs.clone();
-    views.extend(scene.further);
+    assert_eq!(model.network_views().unwrap(), 6, "the shipped checkpoint learned from two to six");
+    let scene = scene();
+    let views = [scene.views(), scene.further()].concat();
     assert!(views.len() > 6);
     let mut options = short(&model);
-    options.sample.refine = 0;
+    options.pipeline.optimize.iterations = 0;
     options.seeds = vec![0];
     let whole = model.run(&views, &options, &mut go).unwrap();
-    assert!(whole.shown.len() == 6 && whole.shown.is_sorted());
+    assert!(whole.network_views.len() == 6 && whole.network_views.is_sorted());
     let note = whole.notes.iter().find(|n| n.contains("6 of")).unwrap();
-    assert!(whole.shown.iter().all(|&i| note.contains(&views[i].name)), "{note}");
-    options.views = Some(3);
+    assert!(whole.network_views.iter().all(|&i| note.contains(&views[i].name)), "{note}");
+    options.pipeline.network_views = 3;
     let three = model.run(&views, &options, &mut go).unwrap();
-    assert_eq!(three.shown.len(), 3);
-    let alone: Vec<View> = three.shown.iter().map(|&i| views[i].clone()).collect();
-    options.views = None;
+    assert_eq!(three.network_views.len(), 3);
+    let alone: Vec<View> = three.network_views.iter().map(|&i| views[i].clone()).collect();
+    options.pipeline.network_views = 6;
     let found = model.run(&alone, &options, &mut go).unwrap();
-    assert_eq!((found.shown, &found.samples[0].gaussians), (vec![0, 1, 2], &three.samples[0].gaussians));
+    assert_eq!((found.network_views, &found.samples[0].gaussians), (vec![0, 1, 2], &three.samples[0].gaussians));
     // Further views of one place say nothing new.
     let doubled: Vec<View> = views.iter().take(4).cycle().take(12).cloned().collect();
-    assert_eq!(model.run(&doubled, &options, &mut go).unwrap().shown, [0, 1, 2, 3]);
-    options.views = Some(0);
-    assert!(model.run(&views, &options, &mut go).unwrap_err().to_string().contains("views"));
+    assert_eq!(model.run(&doubled, &options, &mut go).unwrap().network_views, [0, 1, 2, 3]);
 }

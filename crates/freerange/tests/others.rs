@@ -6,7 +6,7 @@ use freerange::{Scene, View, others_show};
 use image::Rgba;
 
 fn bowl() -> Vec<View> {
-    Scene::load(Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/bowl"))).unwrap().inputs
+    Scene::open(Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/bowl"))).unwrap().loaded.views
 }
 
 #[test]

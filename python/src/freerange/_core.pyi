@@ -9,7 +9,7 @@ _View = tuple[str, _Camera, bytes]
 _Told = tuple[str, _Camera, bytearray]
 _Result = tuple[list[bytearray], tuple[float, float, float], list[str], list[tuple[str, float]]]
 _Up = str | tuple[float, float, float]
-_OnStep = Callable[[str, int, int, int, float | None, list[bytearray] | None], None]
+_OnStep = Callable[[str, int, int, int, float | None, bytearray | None], None]
 
 __version__: str
 
@@ -25,7 +25,7 @@ class Model:
     @property
     def device(self) -> str: ...
     @property
-    def views(self) -> int: ...
+    def network_views(self) -> int: ...
     @property
     def gaussians(self) -> int: ...
     @property
@@ -33,13 +33,13 @@ class Model:
     def reconstruct(
         self,
         raw: list[_View],
-        sampling: dict[str, Any],
+        chosen: dict[str, Any],
         up: _Up,
         center: tuple[float, float, float] | None,
         radius: float | None,
         on_step: _OnStep | None,
     ) -> _Result: ...
-    def reconstruct_scene(self, scene: Scene, sampling: dict[str, Any], on_step: _OnStep | None) -> _Result: ...
+    def reconstruct_scene(self, scene: Scene, chosen: dict[str, Any], on_step: _OnStep | None) -> _Result: ...
 
 class Scene:
     def views(self) -> list[_Told]: ...

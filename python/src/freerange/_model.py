@@ -19,19 +19,19 @@ from ._scene import Scene
 class Step:
     """How far a reconstruction has come."""
 
-    #: "frame", "mirror", "fit", "sample" or "refine", in this order; "mirror" where mirrored photos or turned outlines are looked for.
+    #: "canonicalize", "symmetry", "propose", "refine" or "optimize", in this order; the last three for each sample.
     stage: str
-    #: Which of the samples, where they are worked on one after the other: in "refine".
+    #: Which of the samples is worked on, from 0.
     sample: int
     #: Steps of the stage that are done; 0 when it begins.
     done: int
     #: All its steps.
     total: int
-    #: The photometric loss of the last step of a fit, of polishing or of a refinement.
+    #: The photometric loss of the last step of a fit or of the optimization.
     loss: float | None
-    #: What is known of the Gaussians by now, in your cameras' frame: of each sample in "sample", else one. Empty when a stage
-    #: begins, in "mirror", while a sample is polished or mended, and where the work is on helpers of the first sample.
-    gaussians: tuple[Gaussians, ...]
+    #: The Gaussians by now, in your cameras' frame; none when a stage begins, in "symmetry", and while other proposals than the
+    #: first are worked on.
+    gaussians: Gaussians | None
 
 
 OnStep = Callable[[Step], object]
@@ -62,7 +62,7 @@ class Model:
         self._model = model
 
     def __repr__(self) -> str:
-        return f"<freerange.Model: {self.gaussians} Gaussians, up to {self.views} views, on {self.device}>"
+        return f"<freerange.Model: {self.gaussians} Gaussians, up to {self.network_views} views, on {self.device}>"
 
     @property
     def device(self) -> str:
@@ -70,13 +70,13 @@ class Model:
         return self._model.device
 
     @property
-    def views(self) -> int:
-        """Most views that it has seen at once in training."""
-        return self._model.views
+    def network_views(self) -> int:
+        """Most views that the network sees by default: as many as at once in training."""
+        return self._model.network_views
 
     @property
     def gaussians(self) -> int:
-        """Gaussians that it makes; refinement may make more of them."""
+        """Gaussians that the network makes; the optimization may make more of them."""
         return self._model.gaussians
 
     @property
@@ -119,17 +119,18 @@ class Model:
         direction. `center`, `radius`: where the object is, if that is known. `on_step`: called with a `Step` after each; what it
         raises ends the work, as Ctrl-C does.
 
-        Further options are those of the command line, by default the checkpoint's: `steps`, `refine`, `detail`, `ensemble`, `polish`, `mend`, `regroup`, `mirror`, `turn`,
-        `start` ("fit" or "noise"), `depth`, `cfg_scale`, `lambda_pg`, `solver`, `compute`, `views`.
+        Further options are those of the command line: `quality` ("draft", "default" or "high"), `iterations`, `symmetry` ("auto" or
+        "off"), `init` ("fit" or "flow"), `precision`, `network_views`, and `set`, a dictionary of further fields by their paths, as in
+        `set={"propose.count": 2}`.
         """
-        seeds, sampling = _sampling(seed, options)
+        seeds, chosen = _options(seed, options)
         pictures = _check.images(images, masks)
         sizes = [(picture.shape[1], picture.shape[0]) for picture in pictures]
         cameras = _check.cameras(c2w, intrinsics, sizes, convention, "intrinsics")
         views = [(f"images[{i}]", camera, p.tobytes()) for i, (camera, p) in enumerate(zip(cameras, pictures))]
         center = None if center is None else _check.point("center", center)
         radius = None if radius is None else _check.number("radius", radius)
-        result = self._model.reconstruct(views, sampling, _check.up(up), center, radius, _told(on_step))
+        result = self._model.reconstruct(views, chosen, _check.up(up), center, radius, _told(on_step))
         return _made(result, seeds, seed)
 
     @overload
@@ -147,20 +148,19 @@ class Model:
         **options: Any,
     ) -> Gaussians | list[Gaussians]:
         """Reconstructs a scene, or the folder of one: to the byte what the command line makes of it. Options as `reconstruct`."""
-        seeds, sampling = _sampling(seed, options)
+        seeds, chosen = _options(seed, options)
         if not isinstance(scene, Scene):
             scene = Scene.read(scene)
-        return _made(self._model.reconstruct_scene(scene._scene, sampling, _told(on_step)), seeds, seed)
+        return _made(self._model.reconstruct_scene(scene._scene, chosen, _told(on_step)), seeds, seed)
 
 
-_COUNTS = {"steps": 1, "refine": 0, "detail": 1, "ensemble": 1, "polish": 0, "mend": 0, "regroup": 0, "depth": 1, "views": 1}
-_NUMBERS = ("cfg_scale", "lambda_pg", "mirror", "turn")
-_NAMES = ("start", "solver", "compute")
+_COUNTS = {"iterations": 0, "network_views": 1}
+_NAMES = ("quality", "symmetry", "init", "precision")
 
 
-def _sampling(seed: int | Sequence[int], options: dict[str, Any]) -> tuple[list[int], dict[str, Any]]:
+def _options(seed: int | Sequence[int], options: dict[str, Any]) -> tuple[list[int], dict[str, Any]]:
     """Seeds, and every option; those that are not given are `None`."""
-    known = (*_COUNTS, *_NUMBERS, *_NAMES)
+    known = (*_NAMES, *_COUNTS, "set")
     for name in options:
         if name not in known:
             raise TypeError(f"{name}: expected one of the options {', '.join(known)}, found another name")
@@ -168,19 +168,20 @@ def _sampling(seed: int | Sequence[int], options: dict[str, Any]) -> tuple[list[
     seeds = [_check.count("seed", s, 0, 2**64 - 1) for s in given]
     if not 1 <= len(seeds) <= 64:
         raise _check.refuse("seed", "an integer or 1 to 64 of them", f"{len(seeds)} of them")
-    sampling: dict[str, Any] = {"seeds": seeds}
-    for name in known:
+    fields = options.get("set") or {}
+    if not isinstance(fields, dict) or not all(isinstance(key, str) for key in fields):
+        raise _check.wrong_type("set", "a dictionary of names and values", f"{fields!r}")
+    chosen: dict[str, Any] = {"seeds": seeds, "set": [(key, json.dumps(value)) for key, value in fields.items()]}
+    for name in (*_NAMES, *_COUNTS):
         value = options.get(name)
         if value is None:
             pass
         elif name in _COUNTS:
             value = _check.count(name, value, _COUNTS[name], 2**31)
-        elif name in _NUMBERS:
-            value = _check.number(name, value)
         elif not isinstance(value, str):
             raise _check.wrong_type(name, "a name", f"{value!r}")
-        sampling[name] = value
-    return seeds, sampling
+        chosen[name] = value
+    return seeds, chosen
 
 
 def _told(on_step: OnStep | None) -> Any:
@@ -189,11 +190,8 @@ def _told(on_step: OnStep | None) -> Any:
     if not callable(on_step):
         raise _check.wrong_type("on_step", "a function of a Step", type(on_step).__name__)
 
-    def told(
-        stage: str, sample: int, done: int, total: int, loss: float | None, clouds: list[bytearray] | None
-    ) -> None:
-        gaussians = tuple(Gaussians._of(data) for data in clouds or ())
-        on_step(Step(stage, sample, done, total, loss, gaussians))
+    def told(stage: str, sample: int, done: int, total: int, loss: float | None, cloud: bytearray | None) -> None:
+        on_step(Step(stage, sample, done, total, loss, None if cloud is None else Gaussians._of(cloud)))
 
     return told
 

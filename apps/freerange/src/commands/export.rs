@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use freerange::{checkpoint_bytes, checkpoint_header, sampling};
+use freerange::{SETTINGS_SCHEMA, Settings, checkpoint_bytes, checkpoint_header, network_gaussians};
 use freerange_model::Header;
 
 use crate::{error::CliError, output::OutputFolder, runtime};
@@ -35,22 +35,21 @@ fn parse_license(text: &str) -> Result<String, String> {
 /// What is known of the shipped checkpoint; links in it lead to files beside it.
 const SHIPPED_CARD: &str = include_str!("../../../../docs/model-card.md");
 
-/// Input views that the number of Gaussians is given for: it depends on them in pixel-aligned models alone.
-const VIEWS: usize = 4;
-
 pub fn run(args: &Args) -> Result<(), CliError> {
     let path = runtime::local_or_shipped(args.checkpoint.as_deref())?;
     let bytes = checkpoint_bytes(path.as_deref())?;
     let checkpoint = checkpoint_header(path.as_deref())?;
-    let depth = sampling(&checkpoint.provenance)?.depth_of(checkpoint.depth);
-    let gaussians = checkpoint.config.gaussians(depth, VIEWS) as u64;
+    let gaussians = network_gaussians(&checkpoint.config, &checkpoint.provenance, checkpoint.depth)? as u64;
+    let settings = Settings::of(&checkpoint.provenance).map_err(CliError::input)?;
     let config = serde_json::json!({
         "model_type": "free-range",
         "library_name": "freerange",
         "gaussians": gaussians,
         "architecture": checkpoint.config,
-        "settings_schema": checkpoint.provenance.get("settings_schema"),
-        "sample": checkpoint.provenance.get("sample"),
+        "settings_schema": SETTINGS_SCHEMA,
+        "network_views": settings.network_views,
+        "sample": settings.sample,
+        "refiner": settings.refiner,
     });
     let output = OutputFolder::create("model export", &args.output)?;
     output.write("config.json", (serde_json::to_string_pretty(&config).map_err(CliError::input)? + "\n").as_bytes())?;

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use freerange::{checkpoint_header, choose_views, network_views, to_canonical};
+use freerange::{Settings, checkpoint_header, choose_views, to_canonical};
 use freerange_camera::transforms_json;
 use freerange_scene::{
     inspect::{Inspection, inspect, sheet},
@@ -53,7 +53,9 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         Some(k) => usize::from(k),
         None => {
             let checkpoint = local_or_shipped(args.checkpoint.as_deref())?;
-            network_views(&checkpoint_header(checkpoint.as_deref())?.provenance)
+            Settings::of(&checkpoint_header(checkpoint.as_deref())?.provenance)
+                .map_err(freerange::Error::from)?
+                .network_views
         }
     };
     let (frame, _) = to_canonical(&scene.loaded.views, &scene.frame)?;

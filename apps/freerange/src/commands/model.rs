@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use freerange::{EncoderPlaces, SETTINGS_SCHEMA, checkpoint_header, load_checkpoint, sampling};
+use freerange::{EncoderPlaces, Settings, checkpoint_header, load_checkpoint, network_gaussians};
 use freerange_model::{Compute, Execution, ModelConfig, ModelInfo, WeightsOrigin, Workload};
 
 use crate::{
@@ -95,13 +95,13 @@ pub fn run(command: &Command) -> Result<(), CliError> {
             let mut checkpoint =
                 load_checkpoint(Some(&runtime::local(&args.input)?), &encoders, &burn::tensor::Device::flex())?;
             if let Some(path) = &args.sampling {
-                let sample = serde_json::to_value(TrainConfig::load(path)?.sample).map_err(CliError::input)?;
+                let config = TrainConfig::load(path)?;
                 let Some(provenance) = checkpoint.provenance.as_object_mut() else {
                     let problem = "field `provenance` of the metadata: expected an object";
                     return Err(CliError::file(&args.input, problem));
                 };
-                provenance.insert("sample".into(), sample);
-                provenance.insert("settings_schema".into(), SETTINGS_SCHEMA.into());
+                let network_views = config.loss.input_views.1;
+                Settings { network_views, sample: config.sample, refiner: config.refiner }.write(provenance);
             }
             Ok(checkpoint.save_as(&args.output, freerange_model::Precision::F16)?)
         }
@@ -138,7 +138,7 @@ fn info(args: &Info) -> Result<(), CliError> {
         }
         (file, _) => {
             let c = checkpoint_header(runtime::local_or_shipped(file.as_deref())?.as_deref())?;
-            let depth = sampling(&c.provenance)?.depth_of(c.depth);
+            let depth = network_gaussians(&c.config, &c.provenance, c.depth)?.ilog2();
             (c.config, depth, 1, Compute::F32, false, Some((c.provenance, c.encoder_weights)))
         }
     };

@@ -10,8 +10,7 @@ use std::{
 };
 
 use freerange::{
-    Cloud, Compute, Device, DeviceName, EncoderPlaces, Listed, Options, Reconstructor, SETTINGS_SCHEMA, SampleConfig,
-    Scores, Solver, Stage, View, checkpoint_sha256,
+    Cloud, Listed, PipelineConfig, Reconstructor, SETTINGS_SCHEMA, Scene, Scores, Stage, View,
     pictures::{on_white, render_view, write_turntable},
     score,
 };
@@ -27,66 +26,67 @@ use freerange_splat::{Splats, write_ply_at};
 use serde::Serialize;
 
 use crate::{
-    error::CliError,
-    output::OutputFolder,
-    photos::{Photos, Scene, UpChoice},
-    progress::Progress,
-    ranks::Job,
-    runtime::{commit, local, local_or_shipped},
+    error::CliError, output::OutputFolder, photos::Photos, pipeline::PipelineArgs, progress::Progress, ranks::Job,
+    runtime::commit,
 };
 use holdout::Holdout;
 
-/// Reconstruct an object from posed images.
+/// Reconstruct an object from posed photos.
 ///
-/// Writes gaussians.ply (in the frame of your cameras; --format for others), turntable.gif, inputs/ (each input view
-/// beside its render) and report.json. Of several scenes each gets such a folder in the output, and scenes.json is their table; those that
-/// are finished are passed over, and one that cannot be made does not end the others.
+/// Writes gaussians.ply (in the frame of your cameras; --format for others), turntable.gif, inputs/ (each photo beside its
+/// render) and report.json. Of several scenes each gets such a folder in the output, and scenes.json is their table; finished
+/// scenes are skipped, and a failing scene does not stop the others.
 #[derive(clap::Args)]
+#[command(after_help = EXAMPLES)]
 pub struct Args {
-    /// Folder of photos with cameras: transforms.json (or transforms_train.json and transforms_test.json), a COLMAP model, Polycam's
-    /// keyframes, a Metashape .xml or a RealityCapture .csv; or such a file. Several: each gets a folder of its own in the output.
+    /// Folder of photos with cameras (transforms.json, COLMAP, Polycam, Metashape, RealityCapture, OPF), or the file of cameras;
+    /// several are made one after the other.
     #[arg(required_unless_present = "list")]
     scene: Vec<PathBuf>,
-    /// A file that names a scene on each line, relative to itself; lines that begin with # are passed over.
-    #[arg(long, value_name = "FILE")]
-    list: Option<PathBuf>,
-    /// Of many scenes make only share I of N (from 0), as in an array of jobs. Without it, processes of mpirun or srun share them themselves.
-    #[arg(long, value_name = "I/N", value_parser = share)]
-    share: Option<(usize, usize)>,
-    /// Of many scenes make those again that are finished.
-    #[arg(long)]
-    restart: bool,
     /// Where the results go.
-    #[arg(short, long, default_value = "out")]
+    #[arg(short, long, default_value = "out", help_heading = "Results")]
     output: PathBuf,
-    /// Another scene of the same object whose views are only compared with.
-    #[arg(long, value_name = "SCENE")]
-    validate: Option<PathBuf>,
-    /// Photos to compare with instead of using them: so many, at even steps through the photos, or their names (NAME,NAME).
-    #[arg(long, value_name = "N|NAMES")]
-    holdout: Option<Holdout>,
-    /// Views that the model is shown, from all around the object, if there are more [default: as many as it has seen at
-    /// once in training, six for the shipped one]. Refinement looks at all.
-    #[arg(long, value_name = "K", value_parser = clap::value_parser!(u16).range(1..=256))]
-    views: Option<u16>,
-    /// Start from these Gaussians instead of initial fits: a file of any format, in the frame of the cameras.
-    #[arg(long, value_name = "FILE", conflicts_with = "list")]
-    init: Option<PathBuf>,
+    /// Also write splat, spz, sog, glb, usda, usdz, html (a page that shows them) or colmap.
+    ///
+    /// Several with commas between them. colmap is a folder with the photos, their cameras, and the Gaussians' centers as points.
+    #[arg(long, value_name = "FORMATS", value_delimiter = ',', value_parser = parse_written, help_heading = "Results")]
+    format: Vec<Written>,
+    /// Samples to draw; they differ where the photos leave the object open.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64), hide_short_help = true, help_heading = "Results")]
+    samples: u32,
+    /// Print the report as JSON on standard output.
+    #[arg(long, hide_short_help = true, help_heading = "Results")]
+    json: bool,
+    /// Hold out every N-th photo and compare with it.
+    #[arg(long, value_name = "N", conflicts_with = "holdout", value_parser = clap::value_parser!(u32).range(2..), help_heading = "Comparison")]
+    holdout_every: Option<u32>,
+    /// Hold out the photos of these names (NAME,NAME) and compare with them.
+    #[arg(long, value_name = "NAMES", value_delimiter = ',', hide_short_help = true, help_heading = "Comparison")]
+    holdout: Vec<String>,
+    /// Another scene of the same object, only compared with.
+    #[arg(long, value_name = "SCENE", help_heading = "Comparison")]
+    eval_scene: Option<PathBuf>,
+    #[command(flatten)]
+    pipeline: PipelineArgs,
     #[command(flatten)]
     photos: Photos,
-    #[command(flatten)]
-    sampling: Sampling,
-    /// Samples to draw; they differ where the images leave the object open.
-    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
-    samples: u32,
-    /// Also write the Gaussians in these formats: splat, spz, sog, glb, html (a page that shows them), or colmap (a folder with the photos,
-    /// their cameras, and the Gaussians' middles as points).
-    #[arg(long, value_name = "FORMATS", value_delimiter = ',', value_parser = parse_written)]
-    format: Vec<Written>,
-    /// Print the report as JSON on standard output.
-    #[arg(long)]
-    json: bool,
+    /// A file that names a scene on each line, relative to itself; lines that begin with # are skipped.
+    #[arg(long, value_name = "FILE", help_heading = "Many scenes")]
+    list: Option<PathBuf>,
+    /// Make only part I of N (from 0) of the scenes, as in an array of jobs. Processes of mpirun or srun share them by
+    /// themselves.
+    #[arg(long, value_name = "I/N", value_parser = shard, hide_short_help = true, help_heading = "Many scenes")]
+    shard: Option<(usize, usize)>,
+    /// Make finished scenes again.
+    #[arg(long, hide_short_help = true, help_heading = "Many scenes")]
+    overwrite: bool,
 }
+
+const EXAMPLES: &str = "Examples:
+  freerange reconstruct examples/bowl                       the example, into out/
+  freerange reconstruct photos --masks estimate             photos on a table, with COLMAP's cameras
+  freerange reconstruct photos --holdout-every 8 --quality high
+  freerange reconstruct a b c -o results                    three scenes and a table of them";
 
 /// What results are written as.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -113,154 +113,11 @@ impl std::fmt::Display for Written {
     }
 }
 
-/// Options of every command that samples.
-#[derive(Clone, clap::Args)]
-pub struct Sampling {
-    /// Model to use instead of the shipped one: a file, or hf:owner/name[@revision] for one on the Hugging Face hub.
-    /// What a revision meant when it was first used is kept in the cache.
-    #[arg(long, value_name = "FILE")]
-    pub checkpoint: Option<PathBuf>,
-    /// Folder of the weights (config.json, model.safetensors) of the checkpoint's frozen encoder, if it has one [default:
-    /// where it was when the model was trained, or where `freerange weights fetch` puts it].
-    #[arg(long, value_name = "FOLDER", requires = "checkpoint")]
-    pub encoder_weights: Option<PathBuf>,
-    /// Continue from the sample with so many steps of 3DGS-MCMC on the input views, with more Gaussians and held in place
-    /// where no view looks; 500 are enough, 1000 somewhat sharper, 0 is none. Of more than four views a quarter of it for
-    /// each, up to sixteen [default: the checkpoint's].
-    #[arg(long, value_name = "STEPS")]
-    pub refine: Option<usize>,
-    /// How fine the detail is that refinement looks for, 1 to 16: so many times 256 pixels, at which photos are compared, and
-    /// 8,192 Gaussians, as far as the photos have these pixels. More lowers LPIPS, and hardly changes PSNR, in more time; 1 is
-    /// quickest [default: the checkpoint's].
-    #[arg(long, value_name = "TIMES")]
-    pub detail: Option<usize>,
-    /// Begin that refinement with so many samples together, and hold it at their mean pictures; 1 is the sample alone [default: the checkpoint's].
-    #[arg(long, value_name = "SAMPLES", value_parser = clap::value_parser!(u8).range(1..=64))]
-    pub ensemble: Option<u8>,
-    /// Fit a sample from pure noise to the input views in so many steps before it is mended; 0 is none [default: the checkpoint's].
-    #[arg(long, value_name = "STEPS")]
-    pub polish: Option<usize>,
-    /// Mend a sample from pure noise in so many passes, as fits are mended; 0 is none [default: the checkpoint's].
-    #[arg(long, value_name = "PASSES")]
-    pub mend: Option<usize>,
-    /// Put the Gaussians that a fit is mended to in the order of a tree of their own after every so many steps; 0 is never
-    /// [default: the checkpoint's].
-    #[arg(long, value_name = "STEPS")]
-    pub regroup: Option<usize>,
-    /// Take photos mirrored about the object's plane of symmetry as further input views where, by a fit of both, the photos doubt
-    /// it by at most so much; 0 is never [default: the checkpoint's].
-    #[arg(long, value_name = "MOST")]
-    pub mirror: Option<f32>,
-    /// Fit to outlines turned about the object's axis as well where, by a fit of both, the photos contradict them by at most so much;
-    /// 0 is never [default: the checkpoint's].
-    #[arg(long, value_name = "MOST")]
-    pub turn: Option<f32>,
-    /// Seed of the (first) sample.
-    #[arg(long, default_value_t = 0)]
-    pub seed: u64,
-    /// Steps from noise to Gaussians [default: the checkpoint's].
-    #[arg(long)]
-    pub steps: Option<usize>,
-    /// Start from a quick fit of the input views (fit) or from pure noise (noise) [default: the checkpoint's].
-    #[arg(long, value_enum)]
-    pub start: Option<StartName>,
-    /// Make 2^DEPTH Gaussians [default: the depth of the level-of-detail tree that the checkpoint was trained at].
-    #[arg(long, value_parser = clap::value_parser!(u32).range(4..=16))]
-    pub depth: Option<u32>,
-    /// Classifier-free guidance scale s; 1 is none, and goes alone with a start from a fit [default: the checkpoint's].
-    #[arg(long = "cfg-scale", alias = "guidance")]
-    pub guidance: Option<f32>,
-    /// Photometric guidance scale lambda; 0 is none [default: the checkpoint's].
-    #[arg(long = "lambda-pg", alias = "photometric")]
-    pub photometric: Option<f32>,
-    /// How the steps are taken: euler, heun (two evaluations per step), multistep, or hold (only estimates are fed back)
-    /// [default: the checkpoint's].
-    #[arg(long, value_parser = parse_solver)]
-    pub solver: Option<Solver>,
-    /// Arithmetic of the transformer: f32, bf16 or f16 where the device has it, or auto, the faster of the first two [default:
-    /// the checkpoint's].
-    #[arg(long, value_parser = parse_compute)]
-    pub compute: Option<Compute>,
-    /// Which way is up in the scene's frame: z, y, cameras (where the tops of the photos point), a direction X,Y,Z, or auto:
-    /// z where the cameras' format has it so, else from what the object stands on, or the cameras.
-    #[arg(long, default_value = "auto", allow_hyphen_values = true)]
-    pub up: UpChoice,
-    /// Where to compute: auto, cpu, or cuda, metal, vulkan, webgpu with a number if there are several, as in cuda:1.
-    #[arg(long, default_value = "auto")]
-    pub device: DeviceName,
-}
-
-/// Where sampling starts.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-pub enum StartName {
-    /// A quick fit of the input views.
-    Fit,
-    /// Pure noise, as in the paper.
-    Noise,
-}
-
-/// A solver by its name.
-fn parse_solver(text: &str) -> Result<Solver, String> {
-    serde_json::from_value(text.into()).map_err(|_| "expected euler, heun, multistep or hold".into())
-}
-
-fn share(text: &str) -> Result<(usize, usize), String> {
+fn shard(text: &str) -> Result<(usize, usize), String> {
     let parts = text.split_once('/').and_then(|(i, n)| Some((i.parse().ok()?, n.parse().ok()?)));
     match parts {
         Some((i, n)) if i < n => Ok((i, n)),
         _ => Err("expected I/N with I from 0 to N - 1, as in 0/4".into()),
-    }
-}
-
-/// `f32`, `bf16`, `f16` or `auto`.
-pub fn parse_compute(text: &str) -> Result<Compute, String> {
-    serde_json::from_value(text.into()).map_err(|_| "expected f32, bf16, f16 or auto".into())
-}
-
-impl Sampling {
-    /// The model that the user names, or the shipped one.
-    pub fn open(&self, device: &Device) -> Result<Reconstructor, CliError> {
-        Ok(match &self.checkpoint {
-            Some(path) => Reconstructor::load(&local(path)?, &EncoderPlaces::at(self.encoder_weights.clone()), device)?,
-            None => Reconstructor::shipped(device)?,
-        })
-    }
-
-    /// SHA-256 of that model's checkpoint.
-    pub fn checkpoint_sha256(&self) -> Result<String, CliError> {
-        Ok(checkpoint_sha256(local_or_shipped(self.checkpoint.as_deref())?.as_deref())?)
-    }
-
-    /// The model's own way to sample, with what the user overrides.
-    pub fn options(&self, model: &Reconstructor, samples: u32) -> Result<Options, CliError> {
-        let mut options = model.options()?;
-        if self.start == Some(StartName::Noise) {
-            options.sample = options.sample.without_start();
-        }
-        let sample = &mut options.sample;
-        sample.steps = self.steps.unwrap_or(sample.steps);
-        sample.depth = self.depth.or(sample.depth);
-        sample.start = match self.start {
-            Some(StartName::Noise) => None,
-            Some(StartName::Fit) => Some(sample.start.take().unwrap_or_default()),
-            None => sample.start.take(),
-        };
-        sample.cfg_scale = self.guidance.unwrap_or(sample.cfg_scale);
-        sample.lambda_pg = self.photometric.unwrap_or(sample.lambda_pg);
-        sample.solver = self.solver.unwrap_or(sample.solver);
-        sample.compute = self.compute.unwrap_or(sample.compute);
-        sample.refine = self.refine.unwrap_or(sample.refine);
-        sample.detail = self.detail.unwrap_or(sample.detail);
-        sample.polish = self.polish.unwrap_or(sample.polish);
-        sample.mend = self.mend.unwrap_or(sample.mend);
-        sample.regroup = self.regroup.unwrap_or(sample.regroup);
-        sample.mirror = self.mirror.unwrap_or(sample.mirror);
-        sample.turn = self.turn.unwrap_or(sample.turn);
-        sample.ensemble = self.ensemble.map_or(sample.ensemble, usize::from);
-        options.seeds = (0..u64::from(samples)).map(|i| self.seed.wrapping_add(i)).collect();
-        options.frame.up = self.up.or_z();
-        model.check(&options)?;
-        Ok(options)
     }
 }
 
@@ -271,21 +128,22 @@ struct Watch {
 }
 
 impl Watch {
-    fn at(&mut self, told: &freerange::Progress<'_>) {
-        let label = match told.stage {
-            Stage::Mirror => "looking for symmetry",
-            Stage::Fit => "fitting",
-            Stage::Sample => "sampling",
+    fn at(&mut self, p: &freerange::Progress<'_>) {
+        let label = match p.stage {
+            Stage::Canonicalize if p.total > 1 => "finding the object",
+            Stage::Symmetry => "looking for symmetry",
+            Stage::Propose => "proposing",
             Stage::Refine => "refining",
+            Stage::Optimize => "optimizing",
             _ => return,
         };
-        let task = (told.stage, told.sample);
+        let task = (p.stage, p.sample);
         if self.bar.as_ref().is_none_or(|(at, _)| *at != task) {
             self.finish();
-            self.bar = Some((task, Progress::new(label, told.total as u64)));
+            self.bar = Some((task, Progress::new(label, p.total as u64)));
         }
         if let Some((_, bar)) = &mut self.bar {
-            bar.at(told.done as u64, &told.loss.map_or(String::new(), |loss| format!("loss {loss:.4}")));
+            bar.at(p.done as u64, &p.loss.map_or(String::new(), |loss| format!("loss {loss:.4}")));
         }
     }
 
@@ -326,9 +184,9 @@ struct SceneReport {
     /// What was subtracted from all positions of the scene: results are relative to it.
     #[serde(skip_serializing_if = "Option::is_none")]
     origin: Option<[f64; 3]>,
-    sampling: SampleConfig,
-    /// Names of the views that the model was shown.
-    views_shown: Vec<String>,
+    pipeline: PipelineConfig,
+    /// Names of the photos that the network saw.
+    network_views: Vec<String>,
     /// Names of the photos that were held out: the last of the further views.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     held_out: Vec<String>,
@@ -346,9 +204,9 @@ struct SampleReport {
     file: String,
     input_views: Option<Scores>,
     further_views: Option<Scores>,
-    /// The same without refinement, where there was one.
+    /// The same before the optimization, where there was one.
     #[serde(skip_serializing_if = "Option::is_none")]
-    before_refinement: Option<Before>,
+    before_optimization: Option<Before>,
 }
 
 #[derive(Serialize)]
@@ -357,9 +215,19 @@ struct Before {
     further_views: Option<Scores>,
 }
 
+impl Args {
+    /// The photos that are compared with.
+    fn held_out(&self) -> Result<Holdout, CliError> {
+        match (self.holdout_every, self.holdout.as_slice()) {
+            (Some(n), _) => Ok(Holdout::Every(n as usize)),
+            (None, names) => Holdout::of(names),
+        }
+    }
+}
+
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
-    let job = Job::start_if(batch::asked(args) && args.share.is_none())?;
+    let job = Job::start_if(batch::asked(args) && args.shard.is_none())?;
     let result = run_in(args, &job);
     job.end(result)
 }
@@ -368,17 +236,17 @@ fn run_in(args: &Args, job: &Job) -> Result<(), CliError> {
     if batch::asked(args) {
         return batch::run(args, job);
     }
-    if args.restart {
-        return Err(CliError::input("--restart: expected several scenes, found one: it is always made anew"));
+    if args.overwrite {
+        return Err(CliError::input("--overwrite: expected several scenes, found one: it is always made again"));
     }
     let begin = Instant::now();
     let path = &args.scene[0];
-    let device = job.open(args.sampling.device)?;
-    let model = args.sampling.open(&device)?;
+    let device = job.open(args.pipeline.device)?;
+    let model = args.pipeline.open(&device)?;
     // What cannot be done is refused before photos are read and cut out.
-    args.sampling.options(&model, args.samples)?;
-    let program = Program::of(&model, args.sampling.checkpoint_sha256()?);
-    let scene = args.photos.load(args.photos.cameras(path)?, args.sampling.up)?;
+    args.pipeline.options(&model, args.samples)?;
+    let program = Program::of(&model, args.pipeline.checkpoint_sha256()?);
+    let scene = args.photos.load(args.photos.cameras(path)?, args.pipeline.up)?;
     let (report, json) = reconstruct(args, path, scene, &model, &program, &args.output, begin, || Ok(()))?;
     match args.json {
         true => {
@@ -418,20 +286,22 @@ fn reconstruct(
     begin: Instant,
     commit: impl FnOnce() -> Result<(), CliError>,
 ) -> Result<(SceneReport, String), CliError> {
-    let warnings = scene.warnings(model)?;
+    let warnings = scene.warnings(model.network_views()?)?;
     let origin = Some(scene.cameras.origin).filter(|o| *o != glam::DVec3::ZERO).map(|o| o.to_array());
-    let mut inputs = scene.loaded.views;
-    let mut further = scene.loaded.further;
-    if let Some(path) = &args.validate {
+    let mut loaded = scene.loaded;
+    // Only the cut-out photos are used from here on.
+    drop(std::mem::take(&mut loaded.whole));
+    let (mut inputs, mut further) = (loaded.views, loaded.further);
+    if let Some(path) = &args.eval_scene {
         further.extend(Photos::further(path, scene.cameras.origin)?);
     }
-    let held = args.holdout.as_ref().map(|h| h.take(&mut inputs)).transpose()?.unwrap_or_default();
+    let held = args.held_out()?.take(&mut inputs)?;
     let held_out = held.iter().map(|v| v.name.clone()).collect();
     further.extend(held);
-    let mut options = args.sampling.options(model, args.samples)?;
-    options.views = args.views.map(usize::from);
+    let mut options = args.pipeline.options(model, args.samples)?;
     options.frame = scene.frame;
-    options.init = args.init.as_deref().map(|file| init(file, &inputs, &options.frame)).transpose()?;
+    let file = args.pipeline.init_file();
+    options.init = file.map(|file| init(file, &inputs, &options.frame)).transpose()?;
     let output = OutputFolder::create("reconstruct", folder)?;
     let mut seconds = vec![("load", begin.elapsed().as_secs_f64())];
 
@@ -480,7 +350,7 @@ fn reconstruct(
         for (view, picture) in comparisons(&sample.gaussians, &inputs)? {
             output.picture(&format!("inputs{suffix}/{view}.png"), &picture)?;
         }
-        let before_refinement = match &sample.unrefined {
+        let before_optimization = match &sample.before_optimization {
             None => None,
             Some(plain) => Some(Before { input_views: score(plain, &inputs)?, further_views: score(plain, &further)? }),
         };
@@ -489,20 +359,20 @@ fn reconstruct(
             file,
             input_views: score(&sample.gaussians, &inputs)?,
             further_views: score(&sample.gaussians, &further)?,
-            before_refinement,
+            before_optimization,
         });
     }
     seconds.push(("write", begin.elapsed().as_secs_f64()));
 
-    notes.extend(result.notes.into_iter().map(Note::understood));
+    notes.extend(result.notes);
     let report = SceneReport {
         scene: path.into(),
         program: program.clone(),
         notes,
         settings_schema: SETTINGS_SCHEMA,
         origin,
-        sampling: options.sample,
-        views_shown: result.shown.iter().map(|&i| inputs[i].name.clone()).collect(),
+        pipeline: options.pipeline,
+        network_views: result.network_views.iter().map(|&i| inputs[i].name.clone()).collect(),
         held_out,
         gaussians: result.samples.first().map_or(0, |s| s.gaussians.len()),
         canonical_from_user: in_scene(&result.canonical_from_user, origin),
@@ -564,9 +434,9 @@ fn print(report: &SceneReport, output: &Path) {
                 println!("  {what}: PSNR {:.2} dB, SSIM {:.4} over {} views", s.psnr, s.ssim, s.views.len());
             }
         };
-        if let Some(before) = &sample.before_refinement {
-            line("input views before refinement", &before.input_views);
-            line("further views before refinement", &before.further_views);
+        if let Some(before) = &sample.before_optimization {
+            line("input views before optimization", &before.input_views);
+            line("further views before optimization", &before.further_views);
         }
         line("input views", &sample.input_views);
         line("further views", &sample.further_views);

@@ -2,26 +2,23 @@
 
 use std::{net::IpAddr, ops::ControlFlow, path::PathBuf, process::Command, sync::Arc, time::Duration};
 
-use freerange::{Camera, Cloud, Reconstructor, Stage, View, choose_views, others_show, pictures::render_view};
+use freerange::{
+    Camera, Cloud, Detect, Init, Quality, Reconstructor, View, choose_views, others_show, pictures::render_view,
+};
 use freerange_camera::image_ops::to_picture;
 use freerange_core::IoError;
 use freerange_scene::estimate::OthersShow;
 use freerange_serve::{
-    Engine, EngineError, Example, JobOptions, Limits, Outcome, Scene, ServeConfig, ServeError, Server, Start, Step,
+    Engine, EngineError, Example, JobOptions, Limits, Outcome, Scene, ServeConfig, ServeError, Server, Step,
 };
 use glam::DVec3;
 use image::RgbaImage;
 
-use crate::{
-    commands::reconstruct::{Sampling, StartName},
-    error::CliError,
-    ranks::Job,
-    signals::Signals,
-};
+use crate::{error::CliError, pipeline::PipelineArgs, ranks::Job, signals::Signals};
 
 /// Serve a page: drop photos with cameras, mend masks, and watch the Gaussians appear.
 ///
-/// Listens on this machine only and loads nothing from elsewhere. Options of sampling are the defaults of its jobs. Ctrl-C ends it.
+/// Listens on this machine only and loads nothing from elsewhere. Options of the pipeline are the defaults of its jobs. Ctrl-C ends it.
 #[derive(clap::Args)]
 pub struct Args {
     /// Open the page in the browser.
@@ -56,7 +53,7 @@ pub struct Args {
     #[arg(long, value_name = "JOBS", default_value_t = 32, value_parser = clap::value_parser!(u16).range(1..=10_000))]
     max_jobs: u16,
     #[command(flatten)]
-    sampling: Sampling,
+    pipeline: PipelineArgs,
 }
 
 macro_rules! bowl {
@@ -94,14 +91,18 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     unsafe {
         libc::signal(libc::SIGPIPE, libc::SIG_IGN);
     }
-    let device = Job::alone().open(args.sampling.device)?;
-    let model = args.sampling.open(&device)?;
-    args.sampling.options(&model, 1)?;
-    let place = match &args.sampling.checkpoint {
+    let device = Job::alone().open(args.pipeline.device)?;
+    let model = args.pipeline.open(&device)?;
+    if let Some(file) = args.pipeline.init_file() {
+        let text = format!("--init: expected fit or flow for jobs of many objects, found {}", file.display());
+        return Err(CliError::input(text));
+    }
+    args.pipeline.options(&model, 1)?;
+    let place = match &args.pipeline.checkpoint {
         Some(path) => path.display().to_string(),
         None => "the shipped model".into(),
     };
-    let engine = Local { model, sampling: args.sampling.clone(), name: format!("{place} on {}", args.sampling.device) };
+    let engine = Local { model, pipeline: args.pipeline.clone(), name: format!("{place} on {}", args.pipeline.device) };
     let server = Server::bind(&config, Arc::new(engine))?;
     let stopper = server.stopper();
     signals.on_first(move || stopper.stop())?;
@@ -140,7 +141,7 @@ impl From<ServeError> for CliError {
 /// A model in this process.
 struct Local {
     model: Reconstructor,
-    sampling: Sampling,
+    pipeline: PipelineArgs,
     name: String,
 }
 
@@ -164,7 +165,8 @@ impl Engine for Local {
     }
 
     fn choose(&self, views: &[View]) -> Result<Vec<usize>, String> {
-        choose_views(views, self.model.views()).map_err(|e| e.to_string())
+        let most = self.model.network_views().map_err(|e| e.to_string())?;
+        choose_views(views, most).map_err(|e| e.to_string())
     }
 
     fn others_show(&self) -> Option<OthersShow> {
@@ -177,33 +179,40 @@ impl Engine for Local {
         wanted: &JobOptions,
         tell: &mut dyn FnMut(&Step<'_>) -> ControlFlow<()>,
     ) -> Result<Outcome, EngineError> {
-        let mut sampling = self.sampling.clone();
-        sampling.refine = wanted.refine.or(sampling.refine);
-        sampling.detail = wanted.detail.or(sampling.detail);
-        sampling.steps = wanted.steps.or(sampling.steps);
-        sampling.start = match wanted.start {
-            None => sampling.start,
-            Some(Start::Fit) => Some(StartName::Fit),
-            Some(Start::Noise) => Some(StartName::Noise),
-        };
-        sampling.seed = wanted.seed.unwrap_or(sampling.seed);
-        let mut options = sampling.options(&self.model, wanted.samples.unwrap_or(1)).map_err(told)?;
+        let mut choices = self.pipeline.choices();
+        if let Some(quality) = wanted.quality {
+            choices.quality = match quality {
+                freerange_serve::Quality::Draft => Quality::Draft,
+                freerange_serve::Quality::Default => Quality::Default,
+                freerange_serve::Quality::High => Quality::High,
+            };
+        }
+        choices.iterations = wanted.iterations.or(choices.iterations);
+        let symmetry = wanted.symmetry.map(|s| match s {
+            freerange_serve::Symmetry::Auto => Detect::Auto,
+            freerange_serve::Symmetry::Off => Detect::Off,
+        });
+        choices.symmetry = symmetry.or(choices.symmetry);
+        let init = wanted.init.map(|init| match init {
+            freerange_serve::Init::Fit => Init::Fit,
+            freerange_serve::Init::Flow => Init::Flow,
+        });
+        choices.init = init.or(choices.init);
+        let mut options = self.model.options_of(&choices).map_err(engine_error)?;
+        let first = wanted.seed.unwrap_or(self.pipeline.seed);
+        options.seeds = (0..u64::from(wanted.samples.unwrap_or(1))).map(|i| first.wrapping_add(i)).collect();
         options.frame = scene.frame;
         let run = self.model.run(&scene.views, &options, &mut |p| {
-            let estimate = || {
-                let clouds = p.estimate().map_err(|e| e.to_string())?.unwrap_or_default();
-                let first = if p.stage == Stage::Refine { p.sample } else { 0 };
-                Ok((first..).zip(clouds).collect())
-            };
+            let preview = || p.preview().map_err(|e| e.to_string());
             let (stage, sample, done, total, loss) = (p.stage.name(), p.sample, p.done, p.total, p.loss);
-            tell(&Step { stage, sample, done, total, loss, estimate: &estimate })
+            tell(&Step { stage, sample, done, total, loss, preview: &preview })
         });
         let result = run.map_err(engine_error)?;
         Ok(Outcome {
             samples: result.samples.into_iter().map(|s| (s.seed, s.gaussians)).collect(),
             // The canonical frame has +z up.
             up: (result.canonical_from_user.rotation.inverse() * DVec3::Z).to_array(),
-            notes: result.notes,
+            notes: result.notes.into_iter().map(|note| note.text).collect(),
             seconds: result.seconds.iter().map(|(stage, s)| (stage.name().to_owned(), *s)).collect(),
         })
     }

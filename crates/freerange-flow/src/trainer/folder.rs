@@ -55,6 +55,7 @@ fn check_same_run<M: Making>(config: &TrainConfig<M>, folder: &Path) -> Result<(
                 let mut c = c.clone();
                 c.stages.iter_mut().for_each(|s| s.steps = 0);
                 c.sample = Default::default();
+                c.refiner = None;
                 c.data.workers = 0;
                 // The weights may have moved; the state knows which ones they are.
                 if let EncoderConfig::Dinov2(encoder) = &mut c.model.encoder {

@@ -17,7 +17,7 @@ use crate::{
     config::{DataConfig, Stage},
     optimizer::Flat,
     ranks::threads::among,
-    sample::SampleConfig,
+    sample::{FlowConfig, RefinerConfig},
     train,
 };
 
@@ -296,7 +296,7 @@ fn other_objects_are_measured_now_and_then_and_nothing_else_changes() {
     let place = tempfile::tempdir().unwrap();
     let mut measured = config();
     measured.validation = crate::ValidationConfig { every: 2, objects: 2 };
-    measured.sample = SampleConfig { steps: 2, cfg_scale: 1.0, gradient_size: 16, ..SampleConfig::default() };
+    measured.sample = FlowConfig { steps: 2, cfg_scale: 1.0, gradient_size: 16, ..FlowConfig::default() };
     let run = |name: &str, config: &TrainConfig, until: u64| {
         let mut trainer = open(config, &place.path().join(name), None);
         let (mut losses, mut found) = (Vec::new(), Vec::new());
@@ -440,7 +440,7 @@ fn in_lanes() -> TrainConfig {
     config.stages[0] = Stage { depth: 3, batch: 8, micro_batch: Some(1), steps: 5, ..config.stages[0].clone() };
     config.stages.push(Stage { depth: 4, batch: 4, micro_batch: None, steps: 25, ..config.stages[0].clone() });
     config.validation = crate::ValidationConfig { every: 4, objects: 3 };
-    config.sample = SampleConfig { steps: 1, cfg_scale: 1.0, gradient_size: 16, ..SampleConfig::default() };
+    config.sample = FlowConfig { steps: 1, cfg_scale: 1.0, gradient_size: 16, ..FlowConfig::default() };
     config.validate().unwrap();
     config
 }
@@ -649,12 +649,11 @@ fn lanes_divide_batch_and_window() {
     assert_eq!(found[3], "data.lanes: expected 1 to 4096, found 0");
 }
 
-/// A run whose model starts from fits, on objects that have none.
+/// A run whose model refines initial fits, on objects that have none.
 fn from_fits() -> TrainConfig {
     let mut config = config();
     config.validation = crate::ValidationConfig { every: 1, objects: 1 };
-    let start = crate::sample::StartConfig::default();
-    config.sample = SampleConfig { start: Some(start), cfg_scale: 1.0, gradient_size: 16, ..SampleConfig::default() };
+    config.refiner = Some(RefinerConfig { gradient_size: 16, ..RefinerConfig::default() });
     config
 }
 
@@ -668,7 +667,7 @@ fn a_run_that_could_never_compare_a_sample_is_refused() {
         error.to_string()
     };
     let text = refused(from_fits());
-    assert!(text.contains("validation.objects") && text.contains("sample.start"), "{text}");
+    assert!(text.contains("validation.objects") && text.contains("the refiner"), "{text}");
     let mut config = config();
     config.validation = crate::ValidationConfig { every: 1, objects: 1 };
     config.loss.input_views = (4, 4);
@@ -690,7 +689,7 @@ fn a_measurement_that_is_no_number_is_never_the_best() {
 fn measuring() -> TrainConfig {
     let mut config = config();
     config.validation = crate::ValidationConfig { every: 2, objects: 2 };
-    config.sample = SampleConfig { steps: 1, cfg_scale: 1.0, gradient_size: 16, ..SampleConfig::default() };
+    config.sample = FlowConfig { steps: 1, cfg_scale: 1.0, gradient_size: 16, ..FlowConfig::default() };
     config
 }
 

@@ -167,7 +167,8 @@ pub fn load(cameras: &Cameras, config: &LoadConfig) -> Result<Loaded, SceneError
     let mut notes = Vec::new();
     let masks = mask_files(cameras, config, &mut notes)?;
     let aim = Aim::of(cameras, &masks.of, config)?;
-    let mut pictures = pictures(cameras, &inputs, &masks, aim.as_ref(), config)?;
+    check_pixels(cameras, config)?;
+    let mut pictures = pictures_of(cameras, &inputs, &masks, aim.as_ref(), config)?;
     tell(&pictures, cameras, &inputs, &mut notes);
     let usable = look_at_masks(cameras, &mut pictures, &masks, config, &mut notes)?;
     without_rims(&mut pictures, config, &mut notes);
@@ -199,28 +200,23 @@ pub fn load(cameras: &Cameras, config: &LoadConfig) -> Result<Loaded, SceneError
     Ok(Loaded { views, photos: inputs, whole, further, masks: kind, estimate, notes })
 }
 
-/// The photos of `which`, which together must not be larger than a scene may be.
-fn pictures(
-    cameras: &Cameras,
-    which: &[usize],
-    masks: &MaskFiles,
-    aim: Option<&Aim>,
-    config: &LoadConfig,
-) -> Result<Vec<Picture>, SceneError> {
+/// Refuses photos, those that are only compared with among them, that together are larger than a scene may be; before any of
+/// them is decoded.
+fn check_pixels(cameras: &Cameras, config: &LoadConfig) -> Result<(), SceneError> {
     let mut pixels = 0;
-    for i in which {
-        let (w, h) = shrunk_size(size_of(&cameras.photos[*i].image)?, config.max_side);
+    for photo in &cameras.photos {
+        let (w, h) = shrunk_size(size_of(&photo.image)?, config.max_side);
         pixels += u64::from(w) * u64::from(h);
     }
-    if pixels > LARGEST_SCENE {
-        let expected =
-            format!("photos of at most {LARGEST_SCENE} pixels together; fewer of them, or a smaller --max-side");
-        return Err(Invalid::new("--max-side", expected, pixels).into());
+    if pixels <= LARGEST_SCENE {
+        return Ok(());
     }
-    pictures_of(cameras, which, masks, aim, config)
+    let expected =
+        format!("photos of at most {LARGEST_SCENE} pixels together; fewer of them, or a smaller --max-resolution");
+    Err(Invalid::new("--max-resolution", expected, pixels).into())
 }
 
-/// [`pictures`], however many: as many at once as their whole files fit into [`LARGEST_AT_ONCE`].
+/// The photos of `which`: as many at once as their whole files fit into [`LARGEST_AT_ONCE`].
 fn pictures_of(
     cameras: &Cameras,
     which: &[usize],

@@ -161,11 +161,11 @@ impl Board {
             if late || cancel.load(Relaxed) {
                 return ControlFlow::Break(());
             }
-            // Steps of sampling are few, and each is worth a look.
+            // Passes of the network are few, and each is worth a look.
             let due =
-                step.stage == "sample" || last.is_none_or(|at| at.elapsed() >= BETWEEN) || step.done == step.total;
-            let parts = match due.then(|| (step.estimate)()) {
-                Some(Ok(parts)) => parts,
+                step.stage == "refine" || last.is_none_or(|at| at.elapsed() >= BETWEEN) || step.done == step.total;
+            let parts = match due.then(|| (step.preview)()) {
+                Some(Ok(preview)) => preview.map(|cloud| (step.sample, cloud)).into_iter().collect(),
                 Some(Err(e)) => {
                     broken = Some(e);
                     return ControlFlow::Break(());

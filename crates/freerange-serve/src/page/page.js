@@ -262,14 +262,13 @@
     fetching = true;
     try {
       while (job?.state === "running" && job.estimate && job.estimate.number > drawn) {
-        const { id, estimate } = job, { stage } = estimate;
+        const { id, estimate } = job;
         for (const part of estimate.parts) {
           const gaussians = await rows(`/jobs/${id}/estimates/${estimate.number}/${part.sample}`);
           if (!gaussians || job?.id !== id) break;
-          // What all samples start from stands for all.
-          const shown = stage === "fit" ? panes : panes.slice(part.sample, part.sample + 1);
+          const shown = panes.slice(part.sample, part.sample + 1);
           shown.forEach((pane) => pane.viewer.setGaussians(gaussians));
-          shown.forEach((pane, i) => caption(pane, stage === "fit" ? i : part.sample, part.gaussians));
+          shown.forEach((pane) => caption(pane, part.sample, part.gaussians));
         }
         if (job?.id !== id) break;
         drawn = estimate.number;
@@ -345,7 +344,7 @@
 
   // --- One job ---------------------------------------------------------------------------------------------------------
 
-  const WORDS = { frame: "finding the object", mirror: "looking for symmetry", fit: "fitting quickly", sample: "sampling", refine: "refining on the photos" };
+  const WORDS = { canonicalize: "finding the object", symmetry: "looking for symmetry", propose: "proposing", refine: "refining with the network", optimize: "optimizing on the photos" };
 
   /** @param {Status} s */
   const sentence = (s) => {
@@ -501,8 +500,8 @@
     e.preventDefault();
     void attempt(async () => {
       if (!job) return;
-      const start = select("start-at").value, refine = input("refine").value, detail = input("detail").value;
-      const options = { samples: Number(input("samples").value), seed: Number(input("seed").value), ...(start ? { start } : {}), ...(refine === "" ? {} : { refine: Number(refine) }), ...(detail === "" ? {} : { detail: Number(detail) }) };
+      const quality = select("quality").value, init = select("init").value, iterations = input("iterations").value;
+      const options = { samples: Number(input("samples").value), seed: Number(input("seed").value), ...(quality ? { quality } : {}), ...(init ? { init } : {}), ...(iterations === "" ? {} : { iterations: Number(iterations) }) };
       drawn = 0;
       document.body.dataset.estimates = "0";
       delete document.body.dataset.result;

@@ -102,8 +102,9 @@ impl Engine for Fake {
         let seeds = options.seeds();
         let mut ended = false;
         for done in 0..=self.steps {
-            let estimate = || Ok(seeds.iter().map(|s| Self::cloud(*s, done)).enumerate().collect());
-            let step = Step { stage: "sample", sample: 0, done, total: self.steps, loss: None, estimate: &estimate };
+            let sample = seeds.len() - 1;
+            let preview = || Ok(Some(Self::cloud(seeds[sample], done)));
+            let step = Step { stage: "refine", sample, done, total: self.steps, loss: None, preview: &preview };
             if tell(&step).is_break() {
                 ended = true;
                 break;
@@ -118,7 +119,7 @@ impl Engine for Fake {
             samples: seeds.iter().map(|s| (*s, Self::cloud(*s, self.steps))).collect(),
             up: [0.0, 0.0, 1.0],
             notes: vec!["a <b>note</b>".into()],
-            seconds: vec![("sample".into(), 0.1)],
+            seconds: vec![("refine".into(), 0.1)],
         })
     }
 

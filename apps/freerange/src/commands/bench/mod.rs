@@ -9,8 +9,8 @@ use freerange::{Compute, Device, DeviceName, Listed, require};
 use serde::Serialize;
 
 use crate::{
-    commands::reconstruct::parse_compute,
     error::CliError,
+    pipeline::parse_precision,
     ranks::{Job, Sums},
     runtime,
 };
@@ -49,8 +49,8 @@ pub struct Args {
     #[arg(long, default_value_t = 1)]
     objects: usize,
     /// Arithmetic of the transformer [default: bf16 where the device has it, else f32].
-    #[arg(long, value_parser = parse_compute)]
-    compute: Option<Compute>,
+    #[arg(long, value_parser = parse_precision)]
+    precision: Option<Compute>,
     /// Seconds to measure each line for, at least three calls.
     #[arg(long, default_value_t = 1.0)]
     seconds: f64,
@@ -112,7 +112,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     }
     let device = Job::alone().open(args.device)?;
     let Listed { name, gpu, properties, .. } = Listed::of(&device);
-    let compute = args.compute.unwrap_or(Compute::Auto).on(&device);
+    let compute = args.precision.unwrap_or(Compute::Auto).on(&device);
     require(compute, &device)?;
     let sizes = match args.sizes.is_empty() {
         false => args.sizes.clone(),

@@ -5,12 +5,11 @@ use std::{ops::ControlFlow, path::Path, time::Instant};
 use burn::tensor::{Distribution, Tensor};
 use freerange_build::{GaussianSource, generate_object};
 use freerange_camera::View;
-use freerange_fit::quick_fit;
 use freerange_flow::{
     batch::{Conditioning, shrink},
     config::Stage,
     photometric::{Images, Photometric},
-    sample::{SampleConfig, reconstruct},
+    sample::{FlowConfig, FlowSampler},
     trainer::Trainer,
 };
 use freerange_model::{Checkpoint, Compute, EncoderConfig, Execution, FreeRange, ModelConfig, ModelInfo, Workload};
@@ -114,7 +113,7 @@ pub fn sample(
     };
     let views: Vec<View> = object.views[..VIEWS].to_vec();
     let batch: Vec<&[View]> = vec![&views; objects];
-    let settings = SampleConfig { steps, compute, ..config.sample.clone() };
+    let settings = FlowConfig { steps, compute, lod_depth: None, ..config.sample.clone() };
 
     // The parts of a step.
     let (b, n) = (objects, 1usize << stage.depth);
@@ -143,19 +142,14 @@ pub fn sample(
         gradient_seconds += gradient_at(settings.gradient_size)?;
     }
     if settings.lambda_pg > 0.0 {
-        let size = settings.photometric_size.unwrap_or(settings.gradient_size);
-        gradient_seconds += settings.photometric_repeats as f64 * gradient_at(size)?;
+        gradient_seconds += gradient_at(settings.gradient_size)?;
     }
 
-    // The whole, as `reconstruct` does it. One step first: every kernel is compiled by then.
-    let fit = match &settings.start {
-        Some(start) => Some(quick_fit(&views, &start.fit, 0, |_| ControlFlow::Continue(()))?),
-        None => None,
-    };
-    let fits = fit.map(|fit| vec![fit; objects]);
+    // The whole. One step first: every kernel is compiled by then.
     let run = |steps| {
-        let settings = SampleConfig { steps, ..settings.clone() };
-        reconstruct(&checkpoint, &batch, fits.as_deref(), &settings, &[0], device, |_| ControlFlow::Continue(()))
+        let config = &FlowConfig { steps, ..settings.clone() };
+        let sampler = FlowSampler { checkpoint: &checkpoint, config, device };
+        sampler.sample(&batch, &[0], |_| ControlFlow::Continue(()))
     };
     run(1)?;
     let begin = Instant::now();

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use freerange::{Options, SampleConfig};
+use freerange::{FlowConfig, Init, Options, PipelineConfig};
 use freerange_eval::{
     Report, RunFolder,
     ablation::{Set, Study, Values, Variant, variants},
@@ -26,11 +26,12 @@ pub struct Args {
     /// ablations.md and ablations.json.
     #[arg(short, long, value_name = "OUT")]
     output: PathBuf,
-    /// What is varied, one setting at a time: guidance, steps, lambda, scale, gradient, inputs, solver [default: those
-    /// that apply to the checkpoint's way of sampling].
+    /// What is varied, one setting at a time: guidance, steps, lambda, scale, gradient, inputs [default: those that apply].
+    ///
+    /// All but inputs are of the flow: they need --init flow, or a model that only samples.
     #[arg(long, value_delimiter = ',', value_name = "SETS", value_parser = set)]
     sets: Option<Vec<Set>>,
-    /// Numbers of steps of the sets `steps` and `solver`.
+    /// Numbers of steps of the set `steps`.
     #[arg(long, value_delimiter = ',', value_name = "NUMBERS", default_value = "5,10,20,50,100")]
     step_counts: Vec<usize>,
     /// Photometric guidance scales of the set `lambda` [default: a quarter, half, twice and four times the default's].
@@ -42,9 +43,6 @@ pub struct Args {
     /// Numbers of input views of the set `inputs`.
     #[arg(long, value_delimiter = ',', value_name = "NUMBERS", default_value = "2,4,6,9")]
     input_counts: Vec<usize>,
-    /// Solvers of the set `solver`.
-    #[arg(long, value_delimiter = ',', value_name = "NAMES", default_value = "heun,multistep")]
-    solvers: Vec<String>,
     /// Print the study as JSON on standard output.
     #[arg(long)]
     json: bool,
@@ -55,30 +53,25 @@ fn set(text: &str) -> Result<Set, String> {
     Set::ALL.into_iter().find(|s| s.name() == text).ok_or_else(|| format!("expected one of {}", names.join(", ")))
 }
 
-/// The sets that are asked for, or all that apply to a default `sample`: from a fit there is no classifier-free guidance,
+/// The sets that are asked for, or all that apply to a default `pipeline`: only the flow has guidance and steps from noise,
 /// and multiples of no photometric guidance are none.
-fn sets(asked: Option<&[Set]>, sample: &SampleConfig, lambdas: bool) -> Result<Vec<Set>, CliError> {
-    let guided = sample.cfg_scale != 1.0 || sample.lambda_pg != 0.0;
+fn sets(asked: Option<&[Set]>, pipeline: &PipelineConfig, lambdas: bool) -> Result<Vec<Set>, CliError> {
+    let (flow, sampled) = (&pipeline.propose.flow, pipeline.propose.init == Init::Flow);
+    let guided = flow.cfg_scale != 1.0 || flow.lambda_pg != 0.0;
     let applies = |set: &Set| match set {
-        Set::Guidance => guided,
-        Set::Lambda => lambdas || sample.lambda_pg != 0.0,
-        Set::Scale => sample.start.is_none(),
-        Set::Steps | Set::Gradient | Set::Inputs | Set::Solver => true,
+        Set::Inputs => true,
+        Set::Guidance => sampled && guided,
+        Set::Lambda => sampled && (lambdas || flow.lambda_pg != 0.0),
+        Set::Scale | Set::Steps | Set::Gradient => sampled,
     };
     let Some(asked) = asked else { return Ok(Set::ALL.into_iter().filter(applies).collect()) };
-    match asked.iter().find(|set| !applies(set)) {
-        None => Ok(asked.to_vec()),
-        Some(Set::Lambda) => {
-            Err(CliError::input("--sets lambda: expected --lambdas too, found multiples of the default, which is 0"))
-        }
-        Some(Set::Scale) => Err(CliError::input(
-            "--sets scale: expected --start noise, found a start from a fit, which s = 1 goes with alone",
-        )),
-        Some(set) => {
-            let name = set.name();
-            Err(CliError::input(format!("--sets {name}: expected guidance to leave out, found none in the default")))
-        }
-    }
+    let Some(set) = asked.iter().find(|set| !applies(set)) else { return Ok(asked.to_vec()) };
+    let expected = match set {
+        _ if !sampled => "--init flow, found initial fits, to which it means nothing",
+        Set::Lambda => "--lambdas too, found multiples of the default, which is 0",
+        _ => "guidance to leave out, found none in the default",
+    };
+    Err(CliError::input(format!("--sets {}: expected {expected}", set.name())))
 }
 
 /// The folder of the default settings.
@@ -87,7 +80,7 @@ const DEFAULT: &str = "default";
 pub fn run(args: &Args, job: &Job) -> Result<(), CliError> {
     let a = &args.run;
     let inputs = args.checked_inputs()?;
-    let device = job.open(a.sampling.device)?;
+    let device = job.open(a.pipeline.device)?;
     let method = a.open_method(&device)?;
     let Method::Model { model, options: default, sha256 } = &method else {
         return Err(CliError::failure("a model's method expected"));
@@ -100,7 +93,7 @@ pub fn run(args: &Args, job: &Job) -> Result<(), CliError> {
         let settings = a.settings(&method, &[count], &shared, &source);
         let path = args.output.join(folder);
         let prefix = format!("{folder}: ");
-        let folder = job.first_then_others(|| Ok(RunFolder::open(&path, &settings, a.restart && job.first())?))?;
+        let folder = job.first_then_others(|| Ok(RunFolder::open(&path, &settings, a.overwrite && job.first())?))?;
         let method = Box::new(method);
         Ok::<_, CliError>(Run { method, folder, settings, views: a.views.sets(), inputs: vec![count], prefix })
     };
@@ -116,8 +109,8 @@ pub fn run(args: &Args, job: &Job) -> Result<(), CliError> {
         });
     }
     job.together(work(&runs, &shared, args.json, job))?;
-    if a.share.is_some() {
-        println!("this share is done; run again without --share for the report");
+    if a.shard.is_some() {
+        println!("this shard is done; run again without --shard for the report");
         return Ok(());
     }
     if !job.first() {
@@ -132,7 +125,7 @@ type Different = Option<(Options, usize)>;
 impl Args {
     /// Whether processes that were started together share the work.
     pub fn is_shared(&self) -> bool {
-        self.run.share.is_none()
+        self.run.shard.is_none()
     }
 
     /// The number of input views, where the arguments go together.
@@ -154,19 +147,18 @@ impl Args {
 
     /// The variants, and in what they differ from the default.
     fn plan(&self, default: &Options, inputs: usize) -> Result<Vec<(Variant, Different)>, CliError> {
-        let sets = sets(self.sets.as_deref(), &default.sample, self.lambdas.is_some())?;
-        let multiples = || [0.25, 0.5, 2.0, 4.0].map(|factor| factor * default.sample.lambda_pg).into();
+        let sets = sets(self.sets.as_deref(), &default.pipeline, self.lambdas.is_some())?;
+        let multiples = || [0.25, 0.5, 2.0, 4.0].map(|factor| factor * default.pipeline.propose.flow.lambda_pg).into();
         let values = Values {
             steps: self.step_counts.clone(),
             lambda: self.lambdas.clone().unwrap_or_else(multiples),
             scale: self.scales.clone(),
             inputs: self.input_counts.clone(),
-            solvers: self.solvers.clone(),
         };
         let plan = |variant: Variant| {
             let options = apply(&variant, default)?;
             let count = variant.inputs.unwrap_or(inputs);
-            let same = options.sample == default.sample && count == inputs;
+            let same = options.pipeline == default.pipeline && count == inputs;
             Ok((variant, (!same).then_some((options, count))))
         };
         variants(&sets, &values).into_iter().map(plan).collect()
@@ -217,11 +209,11 @@ impl Args {
 /// The default with what a variant changes.
 fn apply(variant: &Variant, default: &Options) -> Result<Options, CliError> {
     let refuse = |e: &dyn std::fmt::Display| CliError::input(format!("setting `{}`: {e}", variant.name));
-    let value: Value = serde_json::to_value(&default.sample).map_err(|e| refuse(&e))?;
-    let sample: SampleConfig = serde_json::from_value(variant.apply(&value)).map_err(|e| refuse(&e))?;
-    sample.validate().map_err(|e| refuse(&e))?;
+    let value: Value = serde_json::to_value(&default.pipeline.propose.flow).map_err(|e| refuse(&e))?;
+    let flow: FlowConfig = serde_json::from_value(variant.apply(&value)).map_err(|e| refuse(&e))?;
+    flow.validate().map_err(|e| refuse(&e))?;
     let mut options = default.clone();
-    options.sample = sample;
+    options.pipeline.propose.flow = flow;
     Ok(options)
 }
 
@@ -241,16 +233,25 @@ mod tests {
 
     #[test]
     fn sets_apply_to_the_way_of_sampling() {
-        let noise = SampleConfig { cfg_scale: 1.5, lambda_pg: 0.035, ..SampleConfig::default() };
-        assert_eq!(sets(None, &noise, false).unwrap(), Set::ALL);
-        let start = Some(freerange::StartConfig::default());
-        let fit = SampleConfig { cfg_scale: 1.0, lambda_pg: 0.0, start, ..SampleConfig::default() };
-        assert_eq!(sets(None, &fit, false).unwrap(), [Set::Steps, Set::Gradient, Set::Inputs, Set::Solver]);
-        assert!(sets(None, &fit, true).unwrap().contains(&Set::Lambda));
-        for (set, word) in [(Set::Guidance, "guidance"), (Set::Lambda, "--lambdas"), (Set::Scale, "--start noise")] {
-            let text = sets(Some(&[Set::Steps, set]), &fit, false).unwrap_err().to_string();
+        let model = freerange::Reconstructor::shipped(&freerange::Device::flex()).unwrap();
+        let fit = model.options().unwrap().pipeline;
+        assert_eq!(sets(None, &fit, true).unwrap(), [Set::Inputs]);
+        let mut flow = fit.clone();
+        flow.propose.init = Init::Flow;
+        (flow.propose.flow.cfg_scale, flow.propose.flow.lambda_pg) = (1.5, 10.0);
+        assert_eq!(sets(None, &flow, false).unwrap(), Set::ALL);
+        let mut plain = flow.clone();
+        (plain.propose.flow.cfg_scale, plain.propose.flow.lambda_pg) = (1.0, 0.0);
+        assert!(sets(None, &plain, true).unwrap().contains(&Set::Lambda));
+        for (set, pipeline, word) in [
+            (Set::Guidance, &plain, "guidance"),
+            (Set::Lambda, &plain, "--lambdas"),
+            (Set::Scale, &fit, "--init flow"),
+            (Set::Steps, &fit, "--init flow"),
+        ] {
+            let text = sets(Some(&[Set::Inputs, set]), pipeline, false).unwrap_err().to_string();
             assert!(text.contains(word) && text.contains("--sets"), "{text}");
-            assert_eq!(sets(Some(&[set]), &noise, false).unwrap(), [set]);
+            assert_eq!(sets(Some(&[set]), &flow, false).unwrap(), [set]);
         }
     }
 }

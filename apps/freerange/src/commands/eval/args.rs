@@ -16,7 +16,10 @@ use super::{
     methods::{Method, MethodName, fit_config},
     sources::{Source, SourceArgs},
 };
-use crate::{commands::reconstruct::Sampling, error::CliError, ranks::Job, runtime::commit};
+use crate::{error::CliError, pipeline::PipelineArgs, ranks::Job, runtime::commit};
+
+const FIT_ITERATIONS: usize = 2000;
+const FIT_SIZE: u32 = 128;
 
 /// What is evaluated, and how.
 #[derive(clap::Args)]
@@ -37,13 +40,13 @@ pub struct RunArgs {
     #[arg(long, value_name = "DIR")]
     pub ply: Option<PathBuf>,
     /// Iterations of `--method fit`.
-    #[arg(long, default_value_t = 2000)]
+    #[arg(long, default_value_t = FIT_ITERATIONS)]
     pub fit_iterations: usize,
     /// Longest side, in pixels, of the images that `--method fit` works on.
-    #[arg(long, default_value_t = 128)]
+    #[arg(long, default_value_t = FIT_SIZE)]
     pub fit_size: u32,
     #[command(flatten)]
-    pub sampling: Sampling,
+    pub pipeline: PipelineArgs,
     /// Samples per object; numbers are means over them, and their disagreement is reported.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
     pub samples: u32,
@@ -63,15 +66,15 @@ pub struct RunArgs {
     pub dino: String,
     /// Throw away what an earlier run has left in the output folder.
     #[arg(long)]
-    pub restart: bool,
+    pub overwrite: bool,
     /// Picture strips: none, or one per object, with those of the worst and best objects or of all of them within
     /// report.html.
     #[arg(long, value_enum, default_value = "extremes")]
     pub pictures: Pictures,
-    /// Work on share I of N only (from 0) and write no report: several processes or devices can fill one folder. Run once
+    /// Work on part I of N only (from 0) and write no report: several processes or devices can fill one folder. Run once
     /// more without it at the end.
     #[arg(long, value_name = "I/N")]
-    pub share: Option<Share>,
+    pub shard: Option<Share>,
 }
 
 /// From where the input views look.
@@ -136,29 +139,29 @@ impl RunArgs {
             return refuse("--method white and ply: expected one sample and one number of inputs, they change nothing");
         }
         let samples = matches!(self.method, MethodName::Model | MethodName::Start);
-        if !samples && self.sampling.refine.is_some() {
-            return refuse("--refine goes with --method model and start only");
+        if let Some(option) = self.pipeline.given().filter(|_| !samples) {
+            return refuse(&format!("{option} goes with --method model and start only"));
         }
-        if !samples && self.sampling.ensemble.is_some() {
-            return refuse("--ensemble goes with --method model and start only");
+        if let Some(file) = self.pipeline.init_file() {
+            let text = format!("--init: expected fit or flow for many objects, found {}", file.display());
+            return Err(CliError::input(text));
+        }
+        if self.method != MethodName::Fit && (self.fit_iterations, self.fit_size) != (FIT_ITERATIONS, FIT_SIZE) {
+            return refuse("--fit-iterations and --fit-size go with --method fit only");
         }
         Ok(match self.method {
             MethodName::Model | MethodName::Start => {
-                let model = self.sampling.open(device)?;
-                let mut options = self.sampling.options(&model, self.samples)?;
+                let model = self.pipeline.open(device)?;
+                let mut options = self.pipeline.options(&model, self.samples)?;
                 options.without_network = self.method == MethodName::Start;
-                if options.without_network && options.sample.start.is_none() {
-                    return refuse(
-                        "--method start: expected a checkpoint that starts from a quick fit, or --start fit",
-                    );
-                }
-                let sha256 = self.sampling.checkpoint_sha256()?;
+                model.check(&options)?;
+                let sha256 = self.pipeline.checkpoint_sha256()?;
                 Method::Model { model: Arc::new(model), options: Box::new(options), sha256 }
             }
             MethodName::Fit => {
-                let seeds = (0..u64::from(self.samples)).map(|i| self.sampling.seed.wrapping_add(i)).collect();
+                let seeds = (0..u64::from(self.samples)).map(|i| self.pipeline.seed.wrapping_add(i)).collect();
                 let config = Box::new(fit_config(self.fit_iterations, self.fit_size));
-                Method::Fit { config, seeds, up: self.sampling.up.or_z() }
+                Method::Fit { config, seeds, up: self.pipeline.up.or_z() }
             }
             MethodName::White => Method::White,
             MethodName::Ply => Method::Ply(self.ply.clone().unwrap_or_default()),
@@ -168,7 +171,7 @@ impl RunArgs {
     /// Opens everything that runs share, and what the objects' numbers depend on.
     pub fn open_shared(&self, device: &Device, job: &Job) -> Result<(Shared, Value), CliError> {
         let (index, count) = job.share();
-        let share = self.share.unwrap_or(Share { index: index as u64, count: count as u64 });
+        let share = self.shard.unwrap_or(Share { index: index as u64, count: count as u64 });
         let source: Source = self.source.open()?;
         let settings = source.settings().clone();
         let config = ScorerConfig {

@@ -22,7 +22,7 @@ use crate::error::CliError;
 pub enum MethodName {
     /// The model.
     Model,
-    /// The model's pipeline with the network left out: the quick fit that sampling starts from, as it is.
+    /// The model's pipeline with the network left out: initial fits are not refined by it.
     Start,
     /// 3DGS-MCMC on the input views alone, without a model.
     Fit,
@@ -74,14 +74,13 @@ pub fn fit_config(iterations: usize, size: u32) -> FitConfig {
 impl runner::Method for Method {
     fn label(&self) -> String {
         match self {
-            Self::Model { options, .. } if options.without_network => match options.sample.refine {
-                0 => "without the network".into(),
-                steps => format!("without the network, refined {steps}"),
-            },
-            Self::Model { options, .. } if options.sample.refine > 0 => {
-                format!("model, refined {}", options.sample.refine)
+            Self::Model { options, .. } => {
+                let what = if options.without_network { "without the network" } else { "model" };
+                match options.pipeline.optimize.iterations {
+                    0 => what.into(),
+                    steps => format!("{what}, optimized {steps}"),
+                }
             }
-            Self::Model { .. } => "model".into(),
             Self::Fit { .. } => "3DGS-MCMC fit".into(),
             Self::White => "white".into(),
             Self::Ply(folder) => folder.file_name().map_or_else(|| "ply".into(), |n| n.to_string_lossy().into_owned()),
@@ -98,8 +97,8 @@ impl Method {
     pub fn settings(&self) -> Value {
         match self {
             Self::Model { options, sha256, .. } => json!({
-                "name": if options.without_network { "start" } else { "model" }, "checkpoint_sha256": sha256, "sample": options.sample, "seeds": options.seeds,
-                "refine": options.sample.refine, "up": format!("{:?}", options.frame.up).to_lowercase(),
+                "name": if options.without_network { "start" } else { "model" }, "checkpoint_sha256": sha256, "pipeline": options.pipeline,
+                "seeds": options.seeds, "up": format!("{:?}", options.frame.up).to_lowercase(),
             }),
             Self::Fit { config, seeds, up } => json!({
                 "name": "fit", "fit": config, "seeds": seeds, "up": format!("{up:?}").to_lowercase(),
@@ -113,10 +112,8 @@ impl Method {
         let mut notes = Vec::new();
         let clouds = match self {
             Self::Model { model, options, .. } => {
-                let mut options = options.clone();
-                options.views = Some(inputs.len());
-                let result = model.run(inputs, &options, &mut |_| ControlFlow::Continue(()))?;
-                notes = result.notes;
+                let result = model.run(inputs, options, &mut |_| ControlFlow::Continue(()))?;
+                notes = result.notes.into_iter().map(|note| note.text).collect();
                 result.samples.into_iter().map(|s| (s.seed, s.gaussians)).collect()
             }
             Self::Fit { config, seeds, up } => {

@@ -54,7 +54,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     }
     let shared = match &args.command {
         Some(Command::Ablations(args)) => args.is_shared(),
-        _ => args.run.share.is_none(),
+        _ => args.run.shard.is_none(),
     };
     let job = Job::start_if(shared)?;
     let result = match &args.command {
@@ -83,7 +83,7 @@ fn evaluate(args: &Args, job: &Job) -> Result<(), CliError> {
     };
     let a = &args.run;
     let opened = || {
-        let device = job.open(a.sampling.device)?;
+        let device = job.open(a.pipeline.device)?;
         let method = a.open_method(&device)?;
         let (shared, source) = a.open_shared(&device, job)?;
         Ok((device, method, shared, source))
@@ -91,12 +91,12 @@ fn evaluate(args: &Args, job: &Job) -> Result<(), CliError> {
     let (device, method, shared, source) = job.together(opened())?;
     let inputs = a.inputs();
     let settings = a.settings(&method, &inputs, &shared, &source);
-    let folder = job.first_then_others(|| Ok(RunFolder::open(output, &settings, a.restart && job.first())?))?;
+    let folder = job.first_then_others(|| Ok(RunFolder::open(output, &settings, a.overwrite && job.first())?))?;
     let run = Run { method: Box::new(method), folder, settings, views: a.views.sets(), inputs, prefix: String::new() };
     let runs = [run];
     job.together(work(&runs, &shared, args.json, job))?;
-    if a.share.is_some() {
-        println!("this share is done; run again without --share for the report");
+    if a.shard.is_some() {
+        println!("this shard is done; run again without --shard for the report");
         return Ok(());
     }
     let report = || {
@@ -108,7 +108,7 @@ fn evaluate(args: &Args, job: &Job) -> Result<(), CliError> {
         let others = others(&report, &shared.commit);
         if !others.is_empty() {
             eprintln!(
-                "some results are of other programs (commit {}; this one is {}): --restart makes them anew",
+                "some results are of other programs (commit {}; this one is {}): --overwrite makes them again",
                 others.join(", "),
                 shared.commit
             );

@@ -79,7 +79,7 @@ impl Mean {
 
 /// Whether the command line asks for many scenes.
 pub fn asked(args: &Args) -> bool {
-    args.scene.len() > 1 || args.list.is_some() || args.share.is_some()
+    args.scene.len() > 1 || args.list.is_some() || args.shard.is_some()
 }
 
 /// Runs the command on many scenes.
@@ -118,7 +118,7 @@ pub fn run(args: &Args, job: &Job) -> Result<(), CliError> {
 /// The table of all scenes, and the error if some failed.
 fn report(args: &Args, rows: Vec<Row>, code: u8) -> Result<(), CliError> {
     let json = serde_json::to_string_pretty(&rows).map_err(CliError::failure)?;
-    let table = match args.share {
+    let table = match args.shard {
         None => "scenes.json".to_owned(),
         Some((i, n)) => format!("scenes-{i}-of-{n}.json"),
     };
@@ -151,20 +151,20 @@ struct Prepared {
 
 impl Prepared {
     fn new(args: &Args, job: &Job) -> Result<Self, CliError> {
-        if args.validate.is_some() {
+        if args.eval_scene.is_some() {
             return Err(CliError::input(
-                "--validate: expected one scene; with several, hold photos out with --holdout",
+                "--eval-scene: expected one scene; with several, hold photos out with --holdout-every",
             ));
         }
         let entries = named(scenes(args)?)?;
-        let (index, count) = args.share.unwrap_or(job.share());
+        let (index, count) = args.shard.unwrap_or(job.share());
         let own: Vec<(usize, Entry)> = entries.into_iter().enumerate().filter(|(i, _)| i % count == index).collect();
-        let device = job.open(args.sampling.device)?;
-        let model = args.sampling.open(&device)?;
-        let checkpoint = args.sampling.checkpoint_sha256()?;
+        let device = job.open(args.pipeline.device)?;
+        let model = args.pipeline.open(&device)?;
+        let checkpoint = args.pipeline.checkpoint_sha256()?;
         let program = Program::of(&model, checkpoint.clone());
         let options = options(args, &model, checkpoint)?;
-        let before = match args.restart {
+        let before = match args.overwrite {
             // Whatever lies there, none of it counts.
             true => own.iter().map(|_| None).collect(),
             false => own.iter().map(|(_, e)| recorded(&args.output.join(&e.name))).collect::<Result<Vec<_>, _>>()?,
@@ -253,22 +253,22 @@ fn named(scenes: Vec<PathBuf>) -> Result<Vec<Entry>, CliError> {
 
 /// What is not the same if the result is not.
 fn options(args: &Args, model: &Reconstructor, checkpoint: String) -> Result<BTreeMap<String, String>, CliError> {
-    let sampling = args.sampling.options(model, args.samples)?;
+    let own = args.pipeline.options(model, args.samples)?;
     let mut formats: Vec<String> = args.format.iter().map(ToString::to_string).collect();
     formats.sort();
     let mut told = BTreeMap::from([
         ("settings_schema".to_owned(), SETTINGS_SCHEMA.to_string()),
         ("checkpoint".into(), checkpoint),
-        ("seeds".into(), format!("{:?}", sampling.seeds)),
-        ("views".into(), format!("{:?}", args.views)),
-        ("up".into(), format!("{:?}", args.sampling.up)),
-        ("holdout".into(), format!("{:?}", args.holdout)),
+        ("seeds".into(), format!("{:?}", own.seeds)),
+        ("init".into(), format!("{:?}", args.pipeline.init)),
+        ("up".into(), format!("{:?}", args.pipeline.up)),
+        ("holdout".into(), format!("{:?}", (args.holdout_every, &args.holdout))),
         ("format".into(), formats.join(",")),
     ]);
     told.extend(args.photos.told());
-    let value = serde_json::to_value(&sampling.sample).map_err(CliError::failure)?;
+    let value = serde_json::to_value(&own.pipeline).map_err(CliError::failure)?;
     if let serde_json::Value::Object(fields) = value {
-        told.extend(fields.into_iter().map(|(name, value)| (format!("sample.{name}"), value.to_string())));
+        told.extend(fields.into_iter().map(|(name, value)| (format!("pipeline.{name}"), value.to_string())));
     }
     Ok(told)
 }
@@ -281,7 +281,7 @@ fn same_options(file: &Path, were: &BTreeMap<String, String>, are: &BTreeMap<Str
         Some(name) => {
             let of = |options: &BTreeMap<String, String>| options.get(name).unwrap_or(&none).clone();
             let text = format!(
-                "`{name}`: expected {} as this scene was made with, found {}; choose another folder, or make all anew with --restart",
+                "`{name}`: expected {} as this scene was made with, found {}; choose another folder, or make all again with --overwrite",
                 of(were),
                 of(are)
             );
@@ -322,7 +322,7 @@ fn one(
         eprintln!("{}: files have changed since it was made: it is made again", entry.name);
     }
     let folder = args.output.join(&entry.name);
-    let scene = args.photos.load(cameras, args.sampling.up)?;
+    let scene = args.photos.load(cameras, args.pipeline.up)?;
     let (report, _) =
         super::reconstruct(args, &entry.scene, scene, model, program, &folder, begin, || forget(&folder))?;
     let row = row(entry, &report, begin.elapsed().as_secs_f64());

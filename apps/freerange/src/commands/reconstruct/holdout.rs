@@ -1,6 +1,6 @@
-//! Photos that are held out for validation.
+//! Photos that are held out for comparison.
 
-use std::{collections::BTreeSet, convert::Infallible, str::FromStr};
+use std::collections::BTreeSet;
 
 use freerange::View;
 
@@ -9,43 +9,37 @@ use crate::error::CliError;
 /// Which photos.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Holdout {
-    /// So many, at even steps through the photos.
-    Count(usize),
+    /// The first of each so many.
+    Every(usize),
     /// Those of these names.
     Names(Vec<String>),
 }
 
-impl FromStr for Holdout {
-    type Err = Infallible;
-
-    /// A whole number is a count; a comma makes a name of it.
-    fn from_str(text: &str) -> Result<Self, Infallible> {
-        Ok(match text.parse() {
-            Ok(count) => Self::Count(count),
-            Err(_) => Self::Names(text.split(',').map(str::trim).filter(|n| !n.is_empty()).map(Into::into).collect()),
-        })
-    }
-}
-
 impl Holdout {
+    /// Photos by their names; no names are no photos.
+    pub fn of(names: &[String]) -> Result<Self, CliError> {
+        let names: Vec<String> = names.iter().map(|n| n.trim().to_owned()).collect();
+        match names.iter().any(String::is_empty) {
+            true => Err(CliError::input("--holdout: expected names of photos, found an empty one")),
+            false => Ok(Self::Names(names)),
+        }
+    }
+
     /// Takes the photos out of `views`. At least two stay.
     pub fn take(&self, views: &mut Vec<View>) -> Result<Vec<View>, CliError> {
-        let most = views.len().saturating_sub(2);
-        let few = |count: usize| match count <= most {
-            true => Ok(()),
-            false => {
-                let all = views.len();
-                Err(CliError::input(format!("--holdout: expected at most {most} of {all} photos, found {count}")))
-            }
+        let all = views.len();
+        let (option, out): (&str, BTreeSet<usize>) = match self {
+            Self::Every(n) => ("--holdout-every", (0..all).step_by(*n).collect()),
+            Self::Names(names) => ("--holdout", names.iter().map(|name| place(name, views)).collect::<Result<_, _>>()?),
         };
-        let out: BTreeSet<usize> = match self {
-            Self::Count(count) => {
-                few(*count)?;
-                (0..*count).map(|i| (2 * i + 1) * views.len() / (2 * count)).collect()
-            }
-            Self::Names(names) => names.iter().map(|name| place(name, views)).collect::<Result<_, _>>()?,
-        };
-        few(out.len())?;
+        if out.is_empty() {
+            return Ok(Vec::new());
+        }
+        let (most, found) = (all.saturating_sub(2), out.len());
+        if found > most {
+            let problem = format!("{option}: expected at most {most} of {all} photos held out, found {found}");
+            return Err(CliError::input(problem));
+        }
         let (mut held, mut kept) = (Vec::new(), Vec::new());
         for (i, view) in std::mem::take(views).into_iter().enumerate() {
             if out.contains(&i) { held.push(view) } else { kept.push(view) }
@@ -78,27 +72,32 @@ mod tests {
         (0..count).map(|i| View { name: format!("{i:03}"), camera, image: image.clone() }).collect()
     }
 
-    fn held(text: &str, count: usize) -> Result<(Vec<String>, usize), String> {
+    fn held(holdout: Result<Holdout, CliError>, count: usize) -> Result<(Vec<String>, usize), String> {
         let mut left = views(count);
-        let out = text.parse::<Holdout>().unwrap().take(&mut left).map_err(|e| e.to_string())?;
+        let out = holdout.and_then(|h| h.take(&mut left)).map_err(|e| e.to_string())?;
         Ok((out.into_iter().map(|v| v.name).collect(), left.len()))
+    }
+
+    fn named(names: &[&str]) -> Result<Holdout, CliError> {
+        Holdout::of(&names.iter().map(|n| (*n).to_owned()).collect::<Vec<_>>())
     }
 
     #[test]
     fn photos_are_taken_by_number_or_name() {
-        assert_eq!(held("2", 8), Ok((vec!["002".into(), "006".into()], 6)));
-        assert_eq!(held("3", 5), Ok((vec!["000".into(), "002".into(), "004".into()], 2)));
-        assert_eq!(held("003.jpg, 001", 5), Ok((vec!["001".into(), "003".into()], 3)));
-        // A comma makes a name of a number, and a name given twice is one photo.
-        assert_eq!(held("004,", 5), Ok((vec!["004".into()], 4)));
-        assert_eq!(held("004,004", 5).unwrap().1, 4);
+        assert_eq!(held(Ok(Holdout::Every(4)), 9), Ok((vec!["000".into(), "004".into(), "008".into()], 6)));
+        assert_eq!(held(Ok(Holdout::Every(8)), 5), Ok((vec!["000".into()], 4)));
+        assert_eq!(held(named(&["003.jpg", " 001"]), 5), Ok((vec!["001".into(), "003".into()], 3)));
+        // A name given twice is one photo, and none are none.
+        assert_eq!(held(named(&["004", "004"]), 5).unwrap().1, 4);
+        assert_eq!(held(named(&[]), 5), Ok((vec![], 5)));
     }
 
     #[test]
     fn what_cannot_be_held_out_is_refused() {
-        assert!(held("4", 5).unwrap_err().contains("at most 3 of 5 photos, found 4"));
-        assert!(held("1000000", 5).unwrap_err().contains("found 1000000"));
-        let text = held("002,door", 5).unwrap_err();
+        assert!(held(Ok(Holdout::Every(2)), 3).unwrap_err().contains("--holdout-every: expected at most 1 of 3"));
+        assert!(held(named(&["000", "001"]), 3).unwrap_err().contains("--holdout: expected at most 1 of 3"));
+        let text = held(named(&["002", "door"]), 5).unwrap_err();
         assert!(text.contains("001, 002") && text.contains("\"door\""), "{text}");
+        assert!(held(named(&["002", ""]), 5).unwrap_err().contains("empty"));
     }
 }
