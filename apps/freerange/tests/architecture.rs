@@ -79,7 +79,8 @@ const ROOMS: &[(&str, &[&str])] = &[
             "freerange-camera",
             "freerange-raster",
             "freerange-metrics",
-            "freerange-mesh", // the true surface
+            "freerange-mesh",    // the true surface
+            "freerange-surface", // the result's
         ],
     ),
     ("freerange-cli", &["*"]),
