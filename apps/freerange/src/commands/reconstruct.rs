@@ -24,6 +24,7 @@ use freerange_eval::memory::peak_memory;
 use freerange_formats::{Format, Frame, WriteOptions};
 use freerange_scene::write_colmap;
 use freerange_splat::{Splats, write_ply_at};
+use freerange_surface::{MeshConfig, MeshFormat, mesh_of, save};
 use serde::Serialize;
 
 use crate::{
@@ -80,7 +81,7 @@ pub struct Args {
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
     samples: u32,
     /// Also write the Gaussians in these formats: splat, spz, sog, glb, html (a page that shows them), or colmap (a folder with the photos,
-    /// their cameras, and the Gaussians' middles as points).
+    /// their cameras, and the Gaussians' middles as points); and mesh.glb, mesh.ply, mesh.obj: triangles with vertex colors.
     #[arg(long, value_name = "FORMATS", value_delimiter = ',', value_parser = parse_written)]
     format: Vec<Written>,
     /// Print the report as JSON on standard output.
@@ -95,12 +96,20 @@ enum Written {
     Gaussians(Format),
     /// COLMAP's sparse model.
     Colmap,
+    /// A triangle mesh.
+    Mesh(MeshFormat),
 }
 
 fn parse_written(text: &str) -> Result<Written, String> {
     match text {
         "colmap" => Ok(Written::Colmap),
-        other => other.parse().map(Written::Gaussians).map_err(|expected: String| format!("{expected}, colmap")),
+        "mesh.glb" => Ok(Written::Mesh(MeshFormat::Glb)),
+        "mesh.ply" => Ok(Written::Mesh(MeshFormat::Ply)),
+        "mesh.obj" => Ok(Written::Mesh(MeshFormat::Obj)),
+        other => other
+            .parse()
+            .map(Written::Gaussians)
+            .map_err(|expected: String| format!("{expected}, colmap, mesh.glb, mesh.ply, mesh.obj")),
     }
 }
 
@@ -109,6 +118,7 @@ impl std::fmt::Display for Written {
         match self {
             Self::Gaussians(format) => format.fmt(f),
             Self::Colmap => f.write_str("colmap"),
+            Self::Mesh(format) => write!(f, "mesh.{format}"),
         }
     }
 }
@@ -454,8 +464,19 @@ fn reconstruct(
         let suffix = if i == 0 { String::new() } else { format!("-{i}") };
         let file = format!("gaussians{suffix}.ply");
         write_ply_at(&sample.gaussians, origin, &output.path(&file)?)?;
+        let splats = Splats { origin: origin.unwrap_or_default().into(), ..sample.gaussians.clone().into() };
+        let mut mesh = None; // one for all of its formats
         for format in &args.format {
             let format = match format {
+                Written::Mesh(format) => {
+                    let name = format!("mesh{suffix}.{format}");
+                    match mesh.get_or_insert_with(|| mesh_of(&splats, &MeshConfig::default())) {
+                        Ok(mesh) => save(mesh, &output.path(&name)?, frame.to(Frame::Y_UP))?,
+                        // The Gaussians are there all the same.
+                        Err(e) => notes.push(Note::dropped(format!("{name}: {e}"))),
+                    }
+                    continue;
+                }
                 Written::Gaussians(Format::Ply) => continue,
                 Written::Gaussians(format) => format,
                 Written::Colmap => {
@@ -472,7 +493,6 @@ fn reconstruct(
             let name = if *format == Format::Html { "view" } else { "gaussians" };
             let options = WriteOptions { frame, ..WriteOptions::default() };
             let path = output.path(&format!("{name}{suffix}.{format}"))?;
-            let splats = Splats { origin: origin.unwrap_or_default().into(), ..sample.gaussians.clone().into() };
             let lost = freerange_formats::write(&splats, &path, &options)?;
             notes.extend(lost.into_iter().map(|note| Note::dropped(format!("{name}{suffix}.{format}: {note}"))));
         }
