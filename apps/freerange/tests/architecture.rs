@@ -80,7 +80,8 @@ const ROOMS: &[(&str, &[&str])] = &[
             "freerange-camera",
             "freerange-raster",
             "freerange-metrics",
-            "freerange-mesh", // the true surface
+            "freerange-mesh",    // the true surface
+            "freerange-surface", // the result's
         ],
     ),
     ("freerange-cli", &["*"]),

@@ -421,6 +421,10 @@ fn generated_objects_several_samples_shares_and_no_folder() {
             (4, 12)
         );
         assert!(m["seconds"].as_f64().unwrap() > 0.0);
+        // The true surface is known.
+        let metric = |name: &str| m["metrics"][name].as_f64().unwrap_or_else(|| panic!("{name}: {m}"));
+        assert!((0.001..0.5).contains(&metric("mesh-chamfer")) && (0.0..=1.0).contains(&metric("mesh-f-score")));
+        assert!(metric("surface-seen-90") >= metric("surface-seen"));
     }
     // The same numbers without a folder, but for what depends on the machine.
     let done = freerange(&[&run[..run.len() - 2], &["--json"]].concat());

@@ -132,9 +132,24 @@ fn convert_makes_meshes() {
         assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
         assert!(String::from_utf8_lossy(&done.stdout).contains("triangles)") && path.metadata().unwrap().len() > 1000);
     }
-    let done = freerange(&["convert", text(&bowl), "m.spz", "--mesh"]);
-    let said = String::from_utf8_lossy(&done.stderr).into_owned();
-    assert!(done.status.code() == Some(2) && said.contains("expected .glb, .ply or .obj, found .spz"), "{said}");
+    let small = folder.path().join("small.glb");
+    let run = |output: &Path, more: &[&str]| {
+        let done = freerange(&[&["convert", text(&bowl), text(output), "--mesh", "--voxels", "40"], more].concat());
+        let said = [done.stdout, done.stderr].map(|v| String::from_utf8_lossy(&v).into_owned()).concat();
+        (done.status.code(), said)
+    };
+    let (code, said) = run(&small, &["--triangles", "300", "--texture", "256"]);
+    assert!(code == Some(0) && said.contains("(300 triangles)"), "{said}");
+    for (name, more, words) in [
+        ("m.spz", ["--triangles", "300"], "expected .glb, .ply or .obj, found .spz"),
+        ("no.obj", ["--texture", "256"], "a texture: expected .glb, found .obj"),
+        ("no.glb", ["--texture", "9999"], "texture: expected 64 to 4096 texels, found 9999"),
+        ("no.glb", ["--triangles", "3"], "triangles: expected at least 4, found 3"),
+        ("no.glb", ["--triangles", "many"], "invalid value 'many'"),
+    ] {
+        let (code, said) = run(&folder.path().join(name), &more);
+        assert!(code == Some(2) && said.contains(words) && !folder.path().join(name).exists(), "{said}");
+    }
 }
 
 #[test]
@@ -154,7 +169,7 @@ fn reconstruct_writes_the_formats_asked_for() {
         "--symmetry",
         "off",
         "--format",
-        "glb,spz,html,ply",
+        "glb,spz,html,ply,mesh.glb,mesh.obj",
     ]);
     assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
     let cloud = read(&output.join("gaussians.ply"), Frame::Z_UP).unwrap().splats.cloud;
@@ -163,6 +178,12 @@ fn reconstruct_writes_the_formats_asked_for() {
         let apart = (0..cloud.len()).map(|i| (found.mean(i) - cloud.mean(i)).length()).fold(0.0, f64::max);
         assert!(found.len() == cloud.len() && apart < 1e-4, "{name}: {apart}");
     }
+    // A mesh, in two formats.
+    let limits = freerange_mesh::LoadLimits::default();
+    let meshes =
+        ["mesh.glb", "mesh.obj"].map(|name| freerange_mesh::load_mesh(&output.join(name), &limits).unwrap().mesh);
+    assert!(meshes[0].triangles.len() > 1000 && meshes[0].triangles.len() == meshes[1].triangles.len());
+    assert!(!meshes[0].colors.is_empty());
     // All formats can be rendered.
     let renders = folder.path().join("renders");
     let cameras = format!("{scene}/transforms_test.json");
@@ -171,9 +192,10 @@ fn reconstruct_writes_the_formats_asked_for() {
     assert!(fs::read_dir(renders).unwrap().count() > 1);
     let done = freerange(&["reconstruct", &scene, "-o", text(&output), "--format", "fbx"]);
     assert_eq!(done.status.code(), Some(2));
-    assert!(
-        String::from_utf8_lossy(&done.stderr).contains("expected one of ply, splat, spz, sog, glb, usda, usdz, html")
-    );
+    let said = String::from_utf8_lossy(&done.stderr).into_owned();
+    for expected in ["expected one of ply, splat, spz, sog, glb, usda, usdz, html", "mesh.glb, mesh.ply, mesh.obj"] {
+        assert!(said.contains(expected), "{said}");
+    }
 }
 
 #[test]

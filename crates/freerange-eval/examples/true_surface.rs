@@ -7,7 +7,7 @@
 use std::{error::Error, ops::ControlFlow, path::Path};
 
 use freerange_camera::Scene;
-use freerange_eval::TrueSurface;
+use freerange_eval::MeshSurface;
 use freerange_fit::{LayerConfig, RefineConfig, refine_on_surface};
 use freerange_mesh::{LoadLimits, load_mesh};
 use freerange_splat::{read_ply, write_ply};
@@ -21,7 +21,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let layer = LayerConfig { steps: number(0, 80)?, points: number(1, 40_000)?, ..LayerConfig::default() };
     let cloud = read_ply(Path::new(result))?.splats.cloud;
     let photos = Scene::load(Path::new(scene))?.inputs;
-    let surface = TrueSurface::new(&load_mesh(Path::new(mesh), &LoadLimits::default())?.mesh);
+    let surface = MeshSurface::new(&load_mesh(Path::new(mesh), &LoadLimits::default())?.mesh);
     let longest = photos.iter().map(|v| v.image.width().max(v.image.height())).max().unwrap_or(0);
     let config = RefineConfig { layer, ..RefineConfig::default().detailed(2, longest) };
     let distance = |at: glam::DVec3| f64::from(surface.nearest(at.as_vec3()).distance);

@@ -55,6 +55,9 @@ pub enum EvalError {
     /// The rasteriser.
     #[error(transparent)]
     Raster(#[from] freerange_raster::RasterError),
+    /// The mesh of a result.
+    #[error(transparent)]
+    Surface(#[from] freerange_surface::SurfaceError),
     /// A metric.
     #[error(transparent)]
     Metrics(#[from] freerange_metrics::MetricsError),

@@ -26,8 +26,8 @@ const OFFSET: f32 = 1e-3;
 /// Distances that differ by less are equal, and the plainer normal decides: at edges and corners of triangles.
 const EQUAL: f32 = 1e-6;
 
-/// The surface of a true mesh, in the frame of the cameras.
-pub struct TrueSurface {
+/// The surface of a mesh: the true one in the frame of the cameras, or a result's.
+pub struct MeshSurface {
     triangles: Vec<[Vec3; 3]>, // in the order of the hierarchy's leaves
     bvh: Bvh2,
 }
@@ -43,16 +43,25 @@ pub struct Nearest {
     pub distance: f32,
 }
 
-impl TrueSurface {
+impl MeshSurface {
     /// The surface of a mesh with at least one triangle.
     pub fn new(mesh: &Mesh) -> Self {
-        let corners: Vec<[Vec3; 3]> = (0..mesh.triangles.len()).map(|i| mesh.corners(i)).collect();
+        Self::of((0..mesh.triangles.len()).map(|i| mesh.corners(i)).collect())
+    }
+
+    /// The surface of at least one triangle, by their corners.
+    pub(crate) fn of(corners: Vec<[Vec3; 3]>) -> Self {
         let triangle = |&[a, b, c]: &[Vec3; 3]| Triangle { v0: a.into(), v1: b.into(), v2: c.into() };
         let boxes: Vec<Triangle> = corners.iter().map(triangle).collect();
         let params = BvhBuildParams { pre_split: false, ..BvhBuildParams::fast_build() };
         let bvh = build_bvh2_from_tris(&boxes, params, &mut Duration::default());
         let triangles = bvh.primitive_indices.iter().map(|&i| corners[i as usize]).collect();
         Self { triangles, bvh }
+    }
+
+    /// The corners of its triangles, in no particular order.
+    pub(crate) fn triangles(&self) -> &[[Vec3; 3]] {
+        &self.triangles
     }
 
     /// The nearest point of the surface.
@@ -94,7 +103,12 @@ impl TrueSurface {
         if at.normal.dot(to_eye.normalize_or_zero()) < SEEN {
             return false;
         }
-        let ray = Ray::new(start.into(), to_eye.into(), 0.0, 1.0);
+        self.is_free(start, to_eye, 1.0)
+    }
+
+    /// Whether nothing of the surface lies on the way from `start` to `start + along * to`.
+    pub(crate) fn is_free(&self, start: Vec3, along: Vec3, to: f32) -> bool {
+        let ray = Ray::new(start.into(), along.into(), 0.0, to);
         let hit = |ray: &Ray, i: usize| {
             let [a, b, c] = self.triangles[i];
             Triangle { v0: a.into(), v1: b.into(), v2: c.into() }.intersect(ray)
@@ -131,7 +145,7 @@ fn closest_point(p: Vec3, corners: &[Vec3; 3]) -> (Vec3, Vec3) {
 /// If the Gaussians cannot be rendered.
 pub fn surface_metrics(
     cloud: &Cloud,
-    truth: &TrueSurface,
+    truth: &MeshSurface,
     inputs: &[View],
     views: &[View],
 ) -> Result<BTreeMap<String, f64>, EvalError> {
@@ -178,7 +192,7 @@ fn surface_points(cloud: &Cloud, camera: &Camera) -> Result<Vec<Vec3>, EvalError
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use freerange_splat::channel;
     use glam::Quat;
@@ -195,7 +209,7 @@ mod tests {
         }
     }
 
-    fn sphere(radius: f32) -> Mesh {
+    pub(crate) fn sphere(radius: f32) -> Mesh {
         mesh(60, 120, |u, v| {
             let (a, b) = (std::f32::consts::TAU * u, std::f32::consts::PI * (v - 0.5));
             radius * Vec3::new(a.cos() * b.cos(), a.sin() * b.cos(), b.sin())
@@ -210,7 +224,7 @@ mod tests {
         })
     }
 
-    fn cube() -> Mesh {
+    pub(crate) fn cube() -> Mesh {
         let corner = |i: u32| Vec3::new((i & 1) as f32, (i >> 1 & 1) as f32, (i >> 2) as f32) - 0.5;
         let faces = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
         let triangles = faces.into_iter().flat_map(|[a, b, c, d]| [[a, b, c], [a, c, d]]).collect();
@@ -227,7 +241,7 @@ mod tests {
     #[test]
     fn distances_are_those_of_analytic_surfaces() {
         let (ball, ring, block) =
-            (TrueSurface::new(&sphere(0.4)), TrueSurface::new(&torus()), TrueSurface::new(&cube()));
+            (MeshSurface::new(&sphere(0.4)), MeshSurface::new(&torus()), MeshSurface::new(&cube()));
         let mut inside = [0; 3];
         for p in points() {
             let q = p.abs() - 0.5;
@@ -248,7 +262,7 @@ mod tests {
 
     #[test]
     fn a_camera_sees_what_faces_it_and_is_not_hidden() {
-        let ring = TrueSurface::new(&torus());
+        let ring = MeshSurface::new(&torus());
         let sees = |eye: Vec3, near: Vec3| ring.sees(eye, &ring.nearest(near));
         let eye = Vec3::new(3.0, 0.0, 0.0);
         assert!(sees(eye, Vec3::new(0.45, 0.0, 0.0)));
@@ -261,7 +275,7 @@ mod tests {
     }
 
     /// Flat Gaussians on a sphere.
-    fn shell(radius: f32) -> Cloud {
+    pub(crate) fn shell(radius: f32) -> Cloud {
         let mut cloud = Cloud::default();
         let count = 12000;
         for i in 0..count {
@@ -286,7 +300,7 @@ mod tests {
 
     #[test]
     fn metrics_are_distances_with_their_side_apart_for_what_inputs_see() {
-        let truth = TrueSurface::new(&sphere(0.4));
+        let truth = MeshSurface::new(&sphere(0.4));
         let around = [DVec3::X, DVec3::NEG_X, DVec3::Y, DVec3::NEG_Y].map(|d| view(1.5 * d));
         for (radius, side) in [(0.41, 0.01), (0.38, -0.02), (0.4, 0.0)] {
             let found = surface_metrics(&shell(radius), &truth, &around[..1], &around).unwrap();

@@ -5,6 +5,7 @@
 //! is for the caller to know.
 
 pub mod ablation;
+mod chamfer;
 pub mod compare;
 pub mod document;
 mod error;
@@ -23,9 +24,10 @@ pub mod statistics;
 mod strip;
 pub mod table;
 
+pub use chamfer::mesh_metrics;
 pub use error::EvalError;
 pub use folder::{Features, RunFolder, differences};
-pub use geometry::{Nearest, TrueSurface, surface_metrics};
+pub use geometry::{MeshSurface, Nearest, surface_metrics};
 pub use object::{EvalObject, Inputs};
 pub use report::{Environment, FORMAT, FrechetVgg, Group, Report, Spread};
 pub use scorer::{Pair, Scorer, ScorerConfig, Scores, UsedFile, fid, frechet_vgg};

@@ -7,7 +7,7 @@ use freerange_core::hex;
 use glam::DVec3;
 use sha2::{Digest, Sha256};
 
-use crate::{EvalError, TrueSurface, record::ViewSet};
+use crate::{EvalError, MeshSurface, record::ViewSet};
 
 /// Restarts of k-means.
 const RESTARTS: usize = 10;
@@ -23,7 +23,7 @@ pub struct EvalObject {
     /// What inputs are chosen from where a set of that size is not given: no validation view, no place twice.
     candidates: Vec<usize>,
     seed: u64,
-    surface: Option<Arc<TrueSurface>>,
+    surface: Option<Arc<MeshSurface>>,
 }
 
 /// Inputs, or why there are none.
@@ -93,12 +93,12 @@ impl EvalObject {
 
     /// The same object with its true surface, in the frame of its cameras.
     #[must_use]
-    pub fn with_surface(self, surface: TrueSurface) -> Self {
+    pub fn with_surface(self, surface: MeshSurface) -> Self {
         Self { surface: Some(Arc::new(surface)), ..self }
     }
 
     /// Its true surface, where that is known.
-    pub fn surface(&self) -> Option<&TrueSurface> {
+    pub fn surface(&self) -> Option<&MeshSurface> {
         self.surface.as_deref()
     }
 

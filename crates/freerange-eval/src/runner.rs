@@ -13,6 +13,7 @@ use crate::{
     Environment, EvalError, EvalObject, Features, Pair, Report, RunFolder, Scorer, document,
     html::{Embed, html},
     memory::{peak_memory, reset_peak_memory},
+    mesh_metrics,
     record::{Case, Measured, Outcome, Record, SampleScores, VggFeatures, ViewScores, ViewSet, means, style},
     statistics::deviation,
     strip, surface_metrics,
@@ -224,9 +225,13 @@ fn score(found: &Reconstructed, object: &EvalObject, inputs: &[View], shared: &S
         (Pictures::None, _) | (_, None) => None,
         (_, Some(first)) => Some(strip(inputs, &validation, first)?),
     };
-    let mut metrics = means(&samples);
+    let (mut metrics, mut notes) = (means(&samples), found.notes.clone());
     if let (Some(truth), Some((_, cloud))) = (object.surface(), found.clouds.first()) {
         metrics.extend(surface_metrics(cloud, truth, inputs, &validation)?);
+        match mesh_metrics(cloud, truth)? {
+            Some(of_mesh) => metrics.extend(of_mesh),
+            None => notes.push("the Gaussians show no surface: no mesh is compared".into()),
+        }
     }
     let measured = Measured {
         metrics,
@@ -240,7 +245,7 @@ fn score(found: &Reconstructed, object: &EvalObject, inputs: &[View], shared: &S
         features: features.len(),
         vgg: vgg_kept,
         picture: picture.is_some(),
-        notes: found.notes.clone(),
+        notes,
         commit: shared.commit.clone(),
     };
     Ok((measured, Features { inception: features, vgg }, picture))

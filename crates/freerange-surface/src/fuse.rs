@@ -6,7 +6,7 @@ use freerange_splat::Splats;
 use glam::{DVec2, DVec3, Vec3};
 use rayon::prelude::*;
 
-use crate::{Shape, SurfaceError, iso_surface};
+use crate::{Shape, SurfaceError, decimate::decimate, iso_surface, texture::bake};
 
 /// Settings of [`mesh_of`].
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -17,16 +17,23 @@ pub struct MeshConfig {
     pub views: usize,
     /// Width and height of their renders, in pixels.
     pub pixels: u32,
+    /// Most triangles; `None` for as many as the voxels give, or [`TEXTURED`] with a texture.
+    pub triangles: Option<usize>,
+    /// Width and greatest height of a texture, in texels; `None` for vertex colors.
+    pub texture: Option<usize>,
 }
+
+/// Most triangles of a mesh with a texture, if no other number is asked for.
+pub const TEXTURED: usize = 20_000;
 
 impl Default for MeshConfig {
     fn default() -> Self {
-        Self { voxels: 160, views: 60, pixels: 400 }
+        Self { voxels: 160, views: 60, pixels: 400, triangles: None, texture: None }
     }
 }
 
-/// Most voxels along a side.
-pub const MOST_VOXELS: usize = 512;
+/// Widths and heights of renders that a texture is taken from are its own, up to this.
+const FINEST: usize = 1024;
 /// Distances are cut off at so many voxels.
 const BAND: f64 = 4.0;
 /// A pixel shows a surface where it is at least so opaque, and the background where it is less than half of that.
@@ -36,21 +43,38 @@ const PART: f64 = 0.01;
 /// The cameras' field of view, in radians.
 const FIELD_OF_VIEW: f64 = 0.6;
 
+impl MeshConfig {
+    fn check(&self) -> Result<(), SurfaceError> {
+        let within = |setting, expected: &str, range: std::ops::RangeInclusive<usize>, found| {
+            let wrong = SurfaceError::Setting { setting, expected: expected.into(), found };
+            if range.contains(&found) { Ok(()) } else { Err(wrong) }
+        };
+        within("voxels", "8 to 512 along the longest side", 8..=512, self.voxels)?;
+        within("triangles", "at least 4", 4..=usize::MAX, self.triangles.unwrap_or(4))?;
+        within("texture", "64 to 4096 texels", 64..=4096, self.texture.unwrap_or(64))
+    }
+}
+
 /// A closed mesh of the Gaussians, seen from all around, with colors.
 ///
 /// # Errors
-/// [`SurfaceError::Voxels`]; [`SurfaceError::Nothing`] where nothing is opaque; [`SurfaceError::Raster`].
+/// [`SurfaceError::Setting`]; [`SurfaceError::Atlas`]; [`SurfaceError::Nothing`] where nothing is opaque; [`SurfaceError::Raster`].
 pub fn mesh_of(splats: &Splats, config: &MeshConfig) -> Result<Shape, SurfaceError> {
-    if !(8..=MOST_VOXELS).contains(&config.voxels) {
-        return Err(SurfaceError::Voxels { most: MOST_VOXELS, found: config.voxels });
-    }
+    config.check()?;
     // Near the origin, as all of this is in 32 bits.
     let local = Splats { origin: DVec3::ZERO, ..splats.clone() };
     let (low, high) = bounds(&local)?;
     let views = Views::around(&local, low, high, config)?;
     let volume = Volume::fuse(&views, low, high, config.voxels);
     let mut shape = iso_surface(&volume.values, volume.size, volume.low, volume.step)?.without_small_parts(PART);
-    shape.colors = views.colors(&shape, BAND * volume.step);
+    if let Some(triangles) = config.triangles.or(config.texture.map(|_| TEXTURED)) {
+        shape = decimate(&shape, triangles);
+    }
+    let color = |position: Vec3, normal: Vec3| views.color(position.as_dvec3(), normal.as_dvec3(), BAND * volume.step);
+    match config.texture {
+        Some(size) => shape = bake(shape, size, color)?,
+        None => shape.colors = shape.positions.par_iter().zip(&shape.normals).map(|(p, n)| color(*p, *n)).collect(),
+    }
     shape.origin = splats.origin;
     Ok(shape)
 }
@@ -118,7 +142,7 @@ impl Views {
     fn around(splats: &Splats, low: DVec3, high: DVec3, config: &MeshConfig) -> Result<Self, SurfaceError> {
         let (center, radius) = (0.5 * (low + high), 0.5 * (high - low).length());
         let distance = 1.02 * radius / (0.5 * FIELD_OF_VIEW).sin();
-        let n = config.views.max(1);
+        let (n, pixels) = (config.views.max(1), config.pixels.max(config.texture.unwrap_or(0).min(FINEST) as u32));
         let cameras: Vec<Camera> = (0..n)
             .map(|i| {
                 // Evenly spread over the sphere.
@@ -126,7 +150,7 @@ impl Views {
                 let turn = i as f64 * std::f64::consts::PI * (3.0 - 5f64.sqrt());
                 let r = (1.0 - z * z).sqrt();
                 let eye = center + distance * DVec3::new(r * turn.cos(), r * turn.sin(), z);
-                Camera::look_at(eye, center, DVec3::Z, FIELD_OF_VIEW, config.pixels, config.pixels)
+                Camera::look_at(eye, center, DVec3::Z, FIELD_OF_VIEW, pixels, pixels)
             })
             .collect();
         let near = (distance - radius).max(1e-6 * distance) as f32;
@@ -150,32 +174,27 @@ impl Views {
         Ok(Self { cameras, renders })
     }
 
-    /// Colors of vertices: means over the renders that show them, those that look straight at them most.
-    fn colors(&self, shape: &Shape, band: f64) -> Vec<Vec3> {
-        let vertices = shape.positions.par_iter().zip(&shape.normals);
-        let color = |(position, normal): (&Vec3, &Vec3)| {
-            let (position, normal) = (position.as_dvec3(), normal.as_dvec3());
-            let (mut sum, mut weights, mut any, mut nearest) = (Vec3::ZERO, 0.0, Vec3::splat(0.5), f64::INFINITY);
-            for (camera, picture) in self.cameras.iter().zip(&self.renders) {
-                let facing = normal.dot((camera.center() - position).normalize());
-                let Some((z, pixel)) = pixel(camera, position) else { continue };
-                if picture.alpha[pixel] < OPAQUE {
-                    continue;
-                }
-                let off = (f64::from(picture.depth[pixel]) - z).abs();
-                if off < nearest {
-                    (nearest, any) = (off, picture.rgb[pixel]);
-                }
-                if facing > 0.0 && off < band {
-                    let weight = facing.powi(4) as f32;
-                    sum += weight * picture.rgb[pixel];
-                    weights += weight;
-                }
+    /// The color of a point of the surface: the mean over the renders that show it, those that look straight at it most.
+    fn color(&self, position: DVec3, normal: DVec3, band: f64) -> Vec3 {
+        let (mut sum, mut weights, mut any, mut nearest) = (Vec3::ZERO, 0.0, Vec3::splat(0.5), f64::INFINITY);
+        for (camera, picture) in self.cameras.iter().zip(&self.renders) {
+            let facing = normal.dot((camera.center() - position).normalize());
+            let Some((z, pixel)) = pixel(camera, position) else { continue };
+            if picture.alpha[pixel] < OPAQUE {
+                continue;
             }
-            let color = if weights > 0.0 { sum / weights } else { any };
-            color.clamp(Vec3::ZERO, Vec3::ONE)
-        };
-        vertices.map(color).collect()
+            let off = (f64::from(picture.depth[pixel]) - z).abs();
+            if off < nearest {
+                (nearest, any) = (off, picture.rgb[pixel]);
+            }
+            if facing > 0.0 && off < band {
+                let weight = facing.powi(4) as f32;
+                sum += weight * picture.rgb[pixel];
+                weights += weight;
+            }
+        }
+        let color = if weights > 0.0 { sum / weights } else { any };
+        color.clamp(Vec3::ZERO, Vec3::ONE)
     }
 }
 
@@ -268,7 +287,7 @@ mod tests {
     fn a_ball_of_gaussians_is_a_closed_ball_with_its_colors() {
         let mut splats = ball(9000, 0.5);
         splats.origin = DVec3::new(1e6, 0.0, 0.0);
-        let config = MeshConfig { voxels: 48, views: 40, pixels: 200 };
+        let config = MeshConfig { voxels: 48, views: 40, pixels: 200, ..MeshConfig::default() };
         let shape = mesh_of(&splats, &config).unwrap();
         assert!(shape.is_closed_manifold());
         assert_eq!(shape.origin, splats.origin);
@@ -288,7 +307,14 @@ mod tests {
         let mut splats = ball(10, 0.5);
         splats.cloud.iter_mut().for_each(|row| row[channel::LOGIT_OPACITY] = -6.0);
         assert!(mesh_of(&splats, &MeshConfig::default()).unwrap_err().to_string().contains("all faint"));
-        let few = MeshConfig { voxels: 4, ..MeshConfig::default() };
-        assert!(mesh_of(&ball(10, 0.5), &few).unwrap_err().to_string().contains("8 to 512"));
+        let refused = |config: MeshConfig| mesh_of(&ball(10, 0.5), &config).unwrap_err().to_string();
+        let default = MeshConfig::default();
+        assert!(
+            refused(MeshConfig { voxels: 4, ..default }).contains("voxels: expected 8 to 512 along the longest side")
+        );
+        assert!(
+            refused(MeshConfig { triangles: Some(3), ..default }).contains("triangles: expected at least 4, found 3")
+        );
+        assert!(refused(MeshConfig { texture: Some(32), ..default }).contains("texture: expected 64 to 4096 texels"));
     }
 }

@@ -34,6 +34,7 @@ pub fn iso_surface(values: &[f32], size: [usize; 3], low: DVec3, step: f64) -> R
         positions: mesh.positions.iter().map(place).collect(),
         normals: mesh.normals.iter().map(|n| Vec3::from_array(*n).normalize_or(Vec3::Z)).collect(),
         colors: Vec::new(),
+        texture: None,
         triangles: mesh.indices.as_chunks::<3>().0.to_vec(),
         origin: DVec3::ZERO,
     })

@@ -2,12 +2,15 @@
 //!
 //! Depths are rendered from cameras on a sphere about the object. A grid of voxels keeps the mean distance to the
 //! surface along the line of sight, cut off at a few voxels ([`Volume`]). What no camera sees is the inside, so meshes
-//! are closed. Marching cubes make triangles of it ([`iso_surface`]), whose vertices take their colors from the renders.
+//! are closed. Marching cubes make triangles of it ([`iso_surface`]), of which edge collapses may leave fewer. Vertices,
+//! or the texels of a texture, take their colors from the renders.
 
+mod decimate;
 mod fuse;
 mod iso;
 mod save;
 mod shape;
+mod texture;
 
 use std::path::{Path, PathBuf};
 
@@ -17,7 +20,7 @@ use freerange_raster::RasterError;
 pub use fuse::{MeshConfig, Volume, mesh_of};
 pub use iso::iso_surface;
 pub use save::{MeshFormat, save};
-pub use shape::Shape;
+pub use shape::{Baked, Shape};
 
 /// Errors of this crate.
 #[derive(Debug, thiserror::Error)]
@@ -34,14 +37,27 @@ pub enum SurfaceError {
         /// What there is.
         found: Box<str>,
     },
-    /// A grid that cannot be marched through.
-    #[error("voxels: expected 8 to {most} along the longest side, found {found}")]
-    Voxels {
-        /// The limit.
-        most: usize,
+    /// A setting that makes no mesh.
+    #[error("{setting}: expected {expected}, found {found}")]
+    Setting {
+        /// Its name.
+        setting: &'static str,
+        /// What it should be.
+        expected: Box<str>,
         /// What was asked for.
         found: usize,
     },
+    /// A file that holds no texture.
+    #[error("{}: a texture: expected .glb, found .{format}", file.display())]
+    NoTexture {
+        /// The file.
+        file: PathBuf,
+        /// Its format.
+        format: MeshFormat,
+    },
+    /// A texture could not be laid out.
+    #[error("texture: {0}")]
+    Atlas(#[from] uvunwrap::Error),
     /// A name whose extension is of no mesh format that is written.
     #[error("{}: extension: expected .glb, .ply or .obj, found {found}", file.display())]
     Unknown {

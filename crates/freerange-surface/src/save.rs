@@ -1,9 +1,13 @@
 //! Mesh files: `.glb`, `.ply`, `.obj`.
 
-use std::{io::Write, path::Path};
+use std::{
+    io::{Cursor, Write},
+    path::Path,
+};
 
 use freerange_core::{IoError, write_atomically};
 use glam::{DMat3, DQuat, DVec3, Vec3};
+use image::ImageFormat;
 use serde_json::json;
 
 use crate::{Shape, SurfaceError};
@@ -11,7 +15,7 @@ use crate::{Shape, SurfaceError};
 /// The kinds of mesh file that are written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MeshFormat {
-    /// `.glb`: binary glTF, +y up by its node's rotation; linear vertex colors.
+    /// `.glb`: binary glTF, +y up by its node's rotation; linear vertex colors, or a texture.
     Glb,
     /// `.ply`: in the frame of the Gaussians; vertex colors as sRGB bytes.
     Ply,
@@ -20,14 +24,42 @@ pub enum MeshFormat {
 }
 
 impl MeshFormat {
+    /// All formats.
+    pub const ALL: [Self; 3] = [Self::Glb, Self::Ply, Self::Obj];
+
+    /// The extension of its files, without the dot.
+    pub fn extension(self) -> &'static str {
+        match self {
+            Self::Glb => "glb",
+            Self::Ply => "ply",
+            Self::Obj => "obj",
+        }
+    }
+
     /// The format of the file `path`, by its extension.
     ///
     /// # Errors
     /// [`SurfaceError::Unknown`].
     pub fn of(path: &Path) -> Result<Self, SurfaceError> {
         let is = |name: &str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(name));
-        let all = [("glb", Self::Glb), ("ply", Self::Ply), ("obj", Self::Obj)];
-        all.into_iter().find(|(name, _)| is(name)).map(|(_, f)| f).ok_or_else(|| SurfaceError::unknown(path))
+        Self::ALL.into_iter().find(|f| is(f.extension())).ok_or_else(|| SurfaceError::unknown(path))
+    }
+
+    /// The same, for a mesh with a texture or without.
+    ///
+    /// # Errors
+    /// [`SurfaceError::Unknown`]; [`SurfaceError::NoTexture`] for all but `.glb`.
+    pub fn with_texture(path: &Path, texture: bool) -> Result<Self, SurfaceError> {
+        match Self::of(path)? {
+            format @ (Self::Ply | Self::Obj) if texture => Err(SurfaceError::NoTexture { file: path.into(), format }),
+            format => Ok(format),
+        }
+    }
+}
+
+impl std::fmt::Display for MeshFormat {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.extension())
     }
 }
 
@@ -35,9 +67,9 @@ impl MeshFormat {
 /// the one with +y up.
 ///
 /// # Errors
-/// [`SurfaceError::Unknown`], [`SurfaceError::Io`].
+/// [`SurfaceError::Unknown`], [`SurfaceError::NoTexture`], [`SurfaceError::Io`].
 pub fn save(shape: &Shape, path: &Path, y_up: DQuat) -> Result<(), SurfaceError> {
-    let bytes = match MeshFormat::of(path)? {
+    let bytes = match MeshFormat::with_texture(path, shape.texture.is_some())? {
         MeshFormat::Glb => glb(shape, y_up),
         MeshFormat::Ply => ply(shape),
         MeshFormat::Obj => obj(shape),
@@ -72,28 +104,52 @@ fn glb(shape: &Shape, y_up: DQuat) -> Vec<u8> {
         let colors: Vec<Vec3> = shape.colors.iter().map(|c| c.map(linear)).collect();
         attributes["COLOR_0"] = add(vectors(&colors), FLOAT, "VEC3", n, 34962).into();
     }
+    let mut material = json!({
+        "pbrMetallicRoughness": { "metallicFactor": 0.0, "roughnessFactor": 1.0 },
+        // The light is in the colors.
+        "extensions": { "KHR_materials_unlit": {} },
+    });
+    if let Some(texture) = &shape.texture {
+        let uvs = texture.uvs.iter().flat_map(|v| v.to_array()).flat_map(f32::to_le_bytes).collect();
+        attributes["TEXCOORD_0"] = add(uvs, FLOAT, "VEC2", n, 34962).into();
+        material["pbrMetallicRoughness"]["baseColorTexture"] = json!({ "index": 0 });
+    }
     let indices = shape.triangles.iter().flatten().flat_map(|i| i.to_le_bytes()).collect();
     let index = add(indices, UNSIGNED_INT, "SCALAR", 3 * shape.triangles.len(), 34963);
     let corner =
         |pick: fn(Vec3, Vec3) -> Vec3| shape.positions.iter().copied().reduce(pick).unwrap_or_default().to_array();
     accessors[position]["min"] = json!(corner(Vec3::min));
     accessors[position]["max"] = json!(corner(Vec3::max));
+    let picture = shape.texture.as_ref().map(|texture| {
+        let mut png = Cursor::new(Vec::new());
+        texture.image.write_to(&mut png, ImageFormat::Png).expect("a picture in memory");
+        let png = png.into_inner();
+        views.push(json!({ "buffer": 0, "byteOffset": binary.len(), "byteLength": png.len() }));
+        binary.extend(png);
+        views.len() - 1
+    });
     let mut node = json!({ "mesh": 0, "rotation": y_up.to_array() });
     if shape.origin != DVec3::ZERO {
         node["translation"] = json!((y_up * shape.origin).to_array());
     }
-    let json = json!({
+    let mut json = json!({
         "asset": { "version": "2.0", "generator": concat!("free-range ", env!("CARGO_PKG_VERSION")) },
         "scene": 0,
         "scenes": [{ "nodes": [0] }],
         "nodes": [node],
         "meshes": [{ "primitives": [{ "attributes": attributes, "indices": index, "material": 0 }] }],
-        // The light is in the colors.
-        "materials": [{ "pbrMetallicRoughness": { "metallicFactor": 0.0, "roughnessFactor": 1.0 } }],
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "materials": [material],
         "accessors": accessors,
         "bufferViews": views,
         "buffers": [{ "byteLength": binary.len() }],
     });
+    if let Some(view) = picture {
+        json["images"] = json!([{ "bufferView": view, "mimeType": "image/png" }]);
+        // Linear, with smaller copies, and no repetition.
+        json["samplers"] = json!([{ "magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071 }]);
+        json["textures"] = json!([{ "source": 0, "sampler": 0 }]);
+    }
     let mut json = serde_json::to_vec(&json).expect("finite numbers and strings");
     json.resize(json.len().next_multiple_of(4), b' ');
     binary.resize(binary.len().next_multiple_of(4), 0);
@@ -171,7 +227,7 @@ mod tests {
         let normals = positions.iter().map(|p| (*p - Vec3::splat(0.25)).normalize()).collect();
         let colors = vec![Vec3::splat(0.5), Vec3::X, Vec3::Y, Vec3::Z];
         let triangles = vec![[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]];
-        Shape { positions, normals, colors, triangles, origin: DVec3::ZERO }
+        Shape { positions, normals, colors, triangles, ..Shape::default() }
     }
 
     #[test]

@@ -2,7 +2,8 @@
 
 use std::collections::HashMap;
 
-use glam::{DVec3, Vec3};
+use glam::{DVec3, Vec2, Vec3};
+use image::RgbImage;
 
 /// A triangle mesh with shared vertices, counter-clockwise seen from outside.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -15,8 +16,19 @@ pub struct Shape {
     pub colors: Vec<Vec3>,
     /// Numbers of vertices. `[triangles]`
     pub triangles: Vec<[u32; 3]>,
+    /// A texture in place of colors. Vertices are doubled where its charts end.
+    pub texture: Option<Baked>,
     /// What positions are relative to.
     pub origin: DVec3,
+}
+
+/// A texture of a mesh.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Baked {
+    /// Places in the picture, 0..1; (0, 0) is its upper left corner. `[vertices]`
+    pub uvs: Vec<Vec2>,
+    /// Colors, sRGB-encoded.
+    pub image: RgbImage,
 }
 
 impl Shape {
@@ -47,7 +59,7 @@ impl Shape {
         0.5 * (at(b) - at(a)).cross(at(c) - at(a)).length()
     }
 
-    /// Leaves out connected parts whose area is less than `share` of the largest one's.
+    /// Leaves out connected parts whose area is less than `share` of the largest one's, and a texture.
     pub fn without_small_parts(&self, share: f64) -> Self {
         let mut parents: Vec<usize> = (0..self.positions.len()).collect();
         fn root(parents: &mut [usize], mut i: usize) -> usize {
@@ -81,6 +93,7 @@ impl Shape {
             normals: pick(&self.normals),
             colors: pick(&self.colors),
             triangles: triangles.map(|t| t.map(|i| numbers[i as usize])).collect(),
+            texture: None,
             origin: self.origin,
         }
     }

@@ -42,12 +42,18 @@ pub struct Args {
     /// Scale about the origin so that two points are LENGTH apart: X,Y,Z:X,Y,Z=LENGTH.
     #[arg(long, value_name = "A:B=LENGTH", value_parser = parse_measure, allow_hyphen_values = true)]
     measure: Option<f64>,
-    /// Write a closed triangle mesh of the surface, with vertex colors: .glb, .ply or .obj.
+    /// Write a closed triangle mesh of the surface, with vertex colors or a texture: .glb, .ply or .obj.
     #[arg(long)]
     mesh: bool,
     /// Voxels along the longest side, of which the mesh is made.
     #[arg(long, value_name = "COUNT", default_value_t = MeshConfig::default().voxels, requires = "mesh")]
     voxels: usize,
+    /// Most triangles of the mesh [default: as many as the voxels give; 20,000 with --texture].
+    #[arg(long, value_name = "COUNT", requires = "mesh")]
+    triangles: Option<usize>,
+    /// Give the mesh a texture so many texels wide instead of vertex colors: 64 to 4096, .glb only.
+    #[arg(long, value_name = "TEXELS", requires = "mesh")]
+    texture: Option<usize>,
 }
 
 fn parse_point(text: &str) -> Result<DVec3, String> {
@@ -84,7 +90,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     let Some((output, inputs)) = args.files.split_last() else { unreachable!("two files are required") };
     // Before anything is read.
     if args.mesh {
-        MeshFormat::of(output)?;
+        MeshFormat::with_texture(output, args.texture.is_some())?;
     } else {
         Format::of(output)?;
     }
@@ -103,7 +109,8 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         eprintln!("note: scaled by {factor}");
     }
     if args.mesh {
-        let shape = mesh_of(&splats, &MeshConfig { voxels: args.voxels, ..MeshConfig::default() })?;
+        let Args { voxels, triangles, texture, .. } = *args;
+        let shape = mesh_of(&splats, &MeshConfig { voxels, triangles, texture, ..MeshConfig::default() })?;
         save(&shape, output, frame.to(Frame::Y_UP))?;
         println!("{} ({} triangles)", output.display(), shape.triangles.len());
         return Ok(());

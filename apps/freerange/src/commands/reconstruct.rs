@@ -23,6 +23,7 @@ use freerange_eval::memory::peak_memory;
 use freerange_formats::{Format, Frame, WriteOptions};
 use freerange_scene::write_colmap;
 use freerange_splat::{Splats, write_ply_at};
+use freerange_surface::{MeshConfig, MeshFormat, mesh_of, save};
 use serde::Serialize;
 
 use crate::{
@@ -46,9 +47,10 @@ pub struct Args {
     /// Where the results go.
     #[arg(short, long, default_value = "out", help_heading = "Results")]
     output: PathBuf,
-    /// Also write splat, spz, sog, glb, usda, usdz, html (a page that shows them) or colmap.
+    /// Also write splat, spz, sog, glb, usda, usdz, html (a page), mesh.glb, mesh.ply, mesh.obj or colmap.
     ///
-    /// Several with commas between them. colmap is a folder with the photos, their cameras, and the Gaussians' centers as points.
+    /// Several with commas between them. Meshes are triangles with vertex colors. colmap is a folder with the photos, their cameras, and
+    /// the Gaussians' centers as points.
     #[arg(long, value_name = "FORMATS", value_delimiter = ',', value_parser = parse_written, help_heading = "Results")]
     format: Vec<Written>,
     /// Samples to draw; they differ where the photos leave the object open.
@@ -95,12 +97,20 @@ enum Written {
     Gaussians(Format),
     /// COLMAP's sparse model.
     Colmap,
+    /// A triangle mesh.
+    Mesh(MeshFormat),
 }
 
 fn parse_written(text: &str) -> Result<Written, String> {
     match text {
         "colmap" => Ok(Written::Colmap),
-        other => other.parse().map(Written::Gaussians).map_err(|expected: String| format!("{expected}, colmap")),
+        "mesh.glb" => Ok(Written::Mesh(MeshFormat::Glb)),
+        "mesh.ply" => Ok(Written::Mesh(MeshFormat::Ply)),
+        "mesh.obj" => Ok(Written::Mesh(MeshFormat::Obj)),
+        other => other
+            .parse()
+            .map(Written::Gaussians)
+            .map_err(|expected: String| format!("{expected}, colmap, mesh.glb, mesh.ply, mesh.obj")),
     }
 }
 
@@ -109,6 +119,7 @@ impl std::fmt::Display for Written {
         match self {
             Self::Gaussians(format) => format.fmt(f),
             Self::Colmap => f.write_str("colmap"),
+            Self::Mesh(format) => write!(f, "mesh.{format}"),
         }
     }
 }
@@ -324,8 +335,19 @@ fn reconstruct(
         let suffix = if i == 0 { String::new() } else { format!("-{i}") };
         let file = format!("gaussians{suffix}.ply");
         write_ply_at(&sample.gaussians, origin, &output.path(&file)?)?;
+        let splats = Splats { origin: origin.unwrap_or_default().into(), ..sample.gaussians.clone().into() };
+        let mut mesh = None; // one for all of its formats
         for format in &args.format {
             let format = match format {
+                Written::Mesh(format) => {
+                    let name = format!("mesh{suffix}.{format}");
+                    match mesh.get_or_insert_with(|| mesh_of(&splats, &MeshConfig::default())) {
+                        Ok(mesh) => save(mesh, &output.path(&name)?, frame.to(Frame::Y_UP))?,
+                        // The Gaussians are there all the same.
+                        Err(e) => notes.push(Note::dropped(format!("{name}: {e}"))),
+                    }
+                    continue;
+                }
                 Written::Gaussians(Format::Ply) => continue,
                 Written::Gaussians(format) => format,
                 Written::Colmap => {
@@ -342,7 +364,6 @@ fn reconstruct(
             let name = if *format == Format::Html { "view" } else { "gaussians" };
             let options = WriteOptions { frame, ..WriteOptions::default() };
             let path = output.path(&format!("{name}{suffix}.{format}"))?;
-            let splats = Splats { origin: origin.unwrap_or_default().into(), ..sample.gaussians.clone().into() };
             let lost = freerange_formats::write(&splats, &path, &options)?;
             notes.extend(lost.into_iter().map(|note| Note::dropped(format!("{name}{suffix}.{format}: {note}"))));
         }

@@ -124,7 +124,7 @@ impl FlowConfig {
         }
         let only = |field: &str, expected: &str, found: String, ok: bool| {
             let expected = format!("{expected} for a {} model, which predicts in one pass", kind.name());
-            check(&format!("{field}"), &expected, found, ok)
+            check(field, &expected, found, ok)
         };
         only("steps", "1", self.steps.to_string(), self.steps == 1)?;
         only("cfg_scale", "1", self.cfg_scale.to_string(), self.cfg_scale == 1.0)?;

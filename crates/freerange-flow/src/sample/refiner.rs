@@ -49,7 +49,7 @@ impl Refiner<'_> {
         let &Self { checkpoint, config, device } = self;
         config.validate().map_err(|e| e.within("refiner"))?;
         let b = proposals.len();
-        if objects.is_empty() || b == 0 || b % objects.len() != 0 {
+        if objects.is_empty() || b == 0 || !b.is_multiple_of(objects.len()) {
             let expected = format!("as many, and some, for each of {} objects", objects.len());
             return Err(Invalid::new("proposals", expected, b).into());
         }

@@ -8,7 +8,7 @@ use std::{
 use freerange_build::{BuildConfig, Item, Items, render_views, true_mesh};
 use freerange_camera::{Scene, View};
 use freerange_data::{ObjectSource, Shards, Split, Store};
-use freerange_eval::{EvalObject, TrueSurface, runner::Objects};
+use freerange_eval::{EvalObject, MeshSurface, runner::Objects};
 use freerange_mesh::{LoadLimits, load_mesh};
 use serde_json::{Value, json};
 
@@ -182,7 +182,7 @@ impl Source {
                 let object = load_scene(name, &folders[index], files)?;
                 let Some(meshes) = meshes else { return Ok(object) };
                 let mesh = load_mesh(&meshes.join(format!("{name}.glb")), &LoadLimits::default())?.mesh;
-                Ok(object.with_surface(TrueSurface::new(&mesh)))
+                Ok(object.with_surface(MeshSurface::new(&mesh)))
             }
             Kind::Shards(shards) => {
                 let metadata = shards.metadata(index as u64)?;
@@ -194,7 +194,7 @@ impl Source {
                 let (views, sets) = render_views(&items[index], config)?;
                 let sets = sets.ok_or_else(|| no_sets(name, views.len()))?;
                 let object = EvalObject::from_sets(name, views, &sets, items[index].seed.unwrap_or(0))?;
-                Ok(object.with_surface(TrueSurface::new(&true_mesh(&items[index], config)?)))
+                Ok(object.with_surface(MeshSurface::new(&true_mesh(&items[index], config)?)))
             }
         }
     }
