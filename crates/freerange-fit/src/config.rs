@@ -128,8 +128,9 @@ pub struct RefineConfig {
     pub coarse_size: u32,
     /// What keeps the cloud where no view looks.
     pub hold: HoldConfig,
-    /// What comes after these steps.
-    pub layer: LayerConfig,
+    /// Whether to start from one opaque layer of Gaussians on the surface of the clouds, in the photos' colors, where photos see it. An
+    /// experiment (`docs/research/surface.md`): off by default.
+    pub layer: bool,
     /// Seed of everything drawn.
     pub seed: u64,
 }
@@ -148,7 +149,7 @@ impl Default for RefineConfig {
             coarse: 0.0,
             coarse_size: 256,
             hold: HoldConfig::default(),
-            layer: LayerConfig::default(),
+            layer: false,
             seed: 0,
         }
     }
@@ -172,35 +173,6 @@ pub struct HoldConfig {
 impl Default for HoldConfig {
     fn default() -> Self {
         Self { weight: 0.1, views: 12, size: 128, radius: 0.5 }
-    }
-}
-
-/// One opaque layer of Gaussians on the object's surface where photos look, put in place after a refinement and optimized on its own. An
-/// experiment (`docs/research/surface.md`): off by default.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct LayerConfig {
-    /// Number of steps. 0: no layer.
-    pub steps: usize,
-    /// Number of points of the whole surface; those that photos see become Gaussians.
-    pub points: usize,
-    /// Part of each move along the surface's normal that is made. 0 to 1.
-    pub along: f64,
-    /// Part of each move across the normal that is made. 0 to 1.
-    pub across: f64,
-    /// Whether Gaussians that are not of the layer move and change their shape.
-    pub free: bool,
-    /// Points that two photos see are moved by up to so much first, to where the photos agree. World units; 0: not at all.
-    pub sweep: f64,
-    /// Learning rate of the centers at the start.
-    pub mean_rate: f64,
-    /// Weight of the renders of the cloud before, where the layer is not, beside a loss of weight 1 on a view.
-    pub hold: f64,
-}
-
-impl Default for LayerConfig {
-    fn default() -> Self {
-        Self { steps: 0, points: 16_384, along: 0.0, across: 0.0, free: false, sweep: 0.0, mean_rate: 5e-4, hold: 0.15 }
     }
 }
 
@@ -337,7 +309,6 @@ impl RefineConfig {
         check_render_size(self.render_size)?;
         fraction("coarse", self.coarse)?;
         check("coarse_size", "at least 1 pixel", self.coarse_size, self.coarse_size > 0)?;
-        self.layer.check()?;
         self.hold.check()
     }
 
@@ -365,17 +336,6 @@ impl RefineConfig {
             seed: self.seed,
             ..FitConfig::default()
         }
-    }
-}
-
-impl LayerConfig {
-    fn check(&self) -> Result<(), FitError> {
-        check("layer.points", "1000 to 1000000", self.points, (1000..=1_000_000).contains(&self.points))?;
-        fraction("layer.along", self.along)?;
-        fraction("layer.across", self.across)?;
-        finite_not_negative("layer.sweep", self.sweep)?;
-        positive("layer.mean_rate", self.mean_rate)?;
-        finite_not_negative("layer.hold", self.hold)
     }
 }
 
@@ -477,10 +437,6 @@ mod tests {
         refused(&|c| c.final_mean_rate = f64::NAN, "final_mean_rate");
         refused(&|c| c.coarse = 1.5, "coarse");
         refused(&|c| c.coarse_size = 0, "coarse_size");
-        refused(&|c| c.layer.points = 0, "layer.points");
-        refused(&|c| c.layer.along = 1.5, "layer.along");
-        refused(&|c| c.layer.across = f64::NAN, "layer.across");
-        refused(&|c| c.layer.mean_rate = 0.0, "layer.mean_rate");
         refused(&|c| c.hold.weight = -1.0, "hold.weight");
         refused(&|c| c.hold.views = 0, "hold.views");
         refused(&|c| c.hold.size = 8, "hold.size");

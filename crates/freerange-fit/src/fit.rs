@@ -6,7 +6,6 @@ use crate::{
     init::random_cloud,
     mcmc::{add_noise, relocate_and_grow},
     objective::{Objective, check_cloud, normalize_rotations},
-    surface::Layer,
     views::Targets,
 };
 use freerange_core::Invalid;
@@ -37,13 +36,12 @@ pub fn fit<'a>(
         Some(cloud) => checked(cloud, config.cap_max)?,
         None => random_cloud(&targets, config, &mut rng),
     };
-    optimise(cloud, &Layer::default(), |_| &targets, config, &mut rng, |_, _| Ok(Vec::new()), progress)
+    optimise(cloud, |_| &targets, config, &mut rng, |_, _| Ok(Vec::new()), progress)
 }
 
-/// The optimisation itself. `layer` stays on its surface; `of_step` is what each step compares with, at whatever size; `more` are further terms of the objective of a cloud over a background.
+/// The optimisation itself. `of_step` is what each step compares with, at whatever size; `more` are further terms of the objective of a cloud over a background.
 pub(crate) fn optimise<'t>(
     mut cloud: Cloud,
-    layer: &Layer,
     of_step: impl Fn(usize) -> &'t Targets,
     config: &FitConfig,
     rng: &mut ChaCha8Rng,
@@ -78,9 +76,7 @@ pub(crate) fn optimise<'t>(
             objective.add_opacity(&cloud, config.opacity_regularizer);
             objective.add_scale(&cloud, config.scale_regularizer);
             objective.check(step)?;
-            let before = layer.rows(&cloud);
             adam.step(cloud.rows_mut(), &objective.gradients, &config.rates.by_channel(mean_rate));
-            layer.keep(&mut cloud, &before);
             normalize_rotations(&mut cloud);
 
             let due = step >= config.growth_start && step % config.refine_every == 0;

@@ -3,7 +3,7 @@
 use crate::{FitError, HoldConfig, objective::Objective};
 use freerange_camera::Camera;
 use freerange_raster::{RasterConfig, render, render_backward};
-use freerange_splat::{Cloud, channel};
+use freerange_splat::Cloud;
 use glam::DVec3;
 
 /// Distance of the cameras from the origin, in radii of the sphere that holds the object: training cameras' own.
@@ -29,8 +29,6 @@ struct Picture {
     /// Premultiplied, over black. `[size, size, 3]`
     rgb: Vec<f32>,
     alpha: Vec<f32>, // [size, size]
-    /// How much each pixel counts; none: 1. `[size, size]`
-    weights: Vec<f32>,
 }
 
 /// Cameras spread evenly over the sphere but for its poles (a Fibonacci spiral), looking at the origin.
@@ -58,24 +56,12 @@ impl Hold {
                 rgb.iter_mut().zip(&out.rgb).for_each(|(sum, x)| *sum += share * x);
                 alpha.iter_mut().zip(&out.alpha).for_each(|(sum, x)| *sum += share * x);
             }
-            Ok(Picture { camera, rgb, alpha, weights: Vec::new() })
+            Ok(Picture { camera, rgb, alpha })
         };
         let wanted = if config.weight > 0.0 { usize::MAX } else { 0 };
         let cameras = around(config.views, config.size, config.radius);
         let pictures = cameras.take(wanted).map(picture).collect::<Result<_, FitError>>()?;
         Ok(Self { pictures, raster, weight: config.weight })
-    }
-
-    /// Lets pixels count only as much as Gaussians from number `layer` of `cloud` on cover them, and `least` in any case.
-    pub fn beside(&mut self, cloud: &Cloud, layer: usize, least: f32) -> Result<(), FitError> {
-        let mut marked = cloud.clone();
-        marked.iter_mut().enumerate().for_each(|(i, row)| row[channel::COLOR].fill(f32::from(u8::from(i < layer))));
-        for picture in &mut self.pictures {
-            let out = render(marked.rows(), &[picture.camera], &[[0.0; 3]], &self.raster)?;
-            let covered = out.rgb.as_chunks::<3>().0.iter().map(|pixel| pixel[0].clamp(0.0, 1.0));
-            picture.weights = covered.map(|c| 1.0 - (1.0 - least) * c).collect();
-        }
-        Ok(())
     }
 
     /// Number of pictures.
@@ -85,13 +71,12 @@ impl Hold {
 
     /// The mean absolute difference between picture `view` and `cloud`, both over `background`, times the weight.
     pub fn objective(&self, cloud: &Cloud, view: usize, background: [f32; 3]) -> Result<Objective, FitError> {
-        let Picture { camera, rgb, alpha, weights } = &self.pictures[view];
+        let Picture { camera, rgb, alpha } = &self.pictures[view];
         let out = render(cloud.rows(), &[*camera], &[background], &self.raster)?;
         let share = (self.weight / out.rgb.len() as f64) as f32;
         let (mut loss, mut d_rgb) = (0.0, vec![0.0; out.rgb.len()]);
         let pixels = out.rgb.as_chunks::<3>().0.iter().zip(rgb.as_chunks::<3>().0).zip(alpha);
-        for (i, (d, ((found, held), alpha))) in d_rgb.as_chunks_mut::<3>().0.iter_mut().zip(pixels).enumerate() {
-            let share = share * weights.get(i).unwrap_or(&1.0);
+        for (d, ((found, held), alpha)) in d_rgb.as_chunks_mut::<3>().0.iter_mut().zip(pixels) {
             for c in 0..3 {
                 let difference = found[c] - (held[c] + (1.0 - alpha) * background[c]);
                 loss += f64::from(share * difference.abs());

@@ -5,7 +5,7 @@
 //! * [`find_mirror`]: the plane about which an object is its own mirror image, and [`mirrored`] photos of it.
 //! * [`find_axis`]: the axis about which it may be turned and keeps its outlines, and [`turned`] ones.
 //! * [`psnr_over_white`]: how well Gaussians show what views show.
-//! * [`refine`]: the same from a cloud that is already good, held where no view looks; [`refine_on_surface`]: a study of its last part.
+//! * [`refine`]: the same from a cloud that is already good, held where no view looks; [`refine_on_surface`]: what a known surface brings.
 //!
 //! Plain Rust over the rasteriser's CPU functions; no tensor library.
 
@@ -30,7 +30,7 @@ mod tests;
 mod views;
 
 pub use axis::{Axis, FoundAxis, axis_steps, find_axis, turned};
-pub use config::{Background, FitConfig, HoldConfig, LayerConfig, Rates, RefineConfig};
+pub use config::{Background, FitConfig, HoldConfig, Rates, RefineConfig};
 pub use error::FitError;
 pub use fit::fit;
 pub use frame::frame_of;

@@ -1,16 +1,14 @@
 //! 3DGS-MCMC that goes on from a cloud that is already good: what a generated sample needs to agree with the photos.
 
 use crate::{
-    Evidence, FitConfig, FitError, FitProgress, HoldConfig, Rates, RefineConfig,
+    Evidence, FitError, FitProgress, RefineConfig,
     fit::{checked, next_views, optimise},
     hold::Hold,
     mcmc::split,
     objective::Objective,
-    surface::{Layer, Surface, look, sweep},
+    surface::{Field, SIDE, layered, surface_of},
     views::Targets,
 };
-use freerange_camera::View;
-use freerange_core::Invalid;
 use freerange_splat::Cloud;
 use glam::DVec3;
 use rand::SeedableRng;
@@ -19,9 +17,6 @@ use std::ops::ControlFlow;
 
 /// Longest side, in pixels, of outlines. They come from guesses, which nobody vouches for to the pixel.
 const OUTLINES: u32 = 128;
-/// How much renders of the cloud before count where the layer is, of where it is not.
-const HELD_LAYER: f32 = 0.05;
-
 /// Improves a cloud's agreement with posed views, and shows more detail by more Gaussians.
 ///
 /// Few views say little of the rest of the object, and Gaussians that only they judge leave the object's surface. Hence a
@@ -29,6 +24,8 @@ const HELD_LAYER: f32 = 0.05;
 /// more view to agree with, though less. `others` are more clouds of the same object. These pictures are the mean of all:
 /// where guesses differ, their mean is nearer to the truth than most. For the same reason the refinement begins with as many
 /// of them in one place as there are to be Gaussians, each fainter, so that together they show about what one alone does.
+/// With a [`layer`](RefineConfig::layer), flat Gaussians take their place wherever a view sees the surface that all of them have in the mean: what several
+/// views show of it begins in one place.
 /// Outlines, where there are any, come beside the views at every other step.
 /// `progress` hears of every step, and ends with what there is by `ControlFlow::Break`. The same input gives the same bytes.
 ///
@@ -40,10 +37,21 @@ pub fn refine<'a>(
     others: &[Cloud],
     seen: impl Into<Evidence<'a>>,
     config: &RefineConfig,
-    mut progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
+    progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Cloud, FitError> {
     config.check()?;
-    let seen = seen.into();
+    refine_from(cloud, others, seen.into(), config, None, progress)
+}
+
+/// The refinement itself; from a layer on `surface`, if there is one.
+fn refine_from(
+    cloud: &Cloud,
+    others: &[Cloud],
+    seen: Evidence<'_>,
+    config: &RefineConfig,
+    surface: Option<&Field>,
+    progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
+) -> Result<Cloud, FitError> {
     let photos = seen.views;
     let targets = Targets::new(seen.views, config.render_size)?;
     let first = (config.coarse * config.steps as f64) as usize;
@@ -54,7 +62,12 @@ pub fn refine<'a>(
     let clouds = std::iter::once(cloud).chain(others).map(|cloud| checked(cloud, usize::MAX));
     let clouds = clouds.collect::<Result<Vec<_>, _>>()?;
     let hold = Hold::new(&clouds, &config.hold)?;
-    let start = together(&clouds, config.gaussians);
+    let mut start = together(&clouds, config.gaussians);
+    if let Some(field) = surface {
+        start = layered(&start, field, photos, config.gaussians)?;
+    } else if config.layer {
+        start = layered(&start, &surface_of(&clouds, photos, config.hold.radius)?, photos, config.gaussians)?;
+    }
     let fit = config.fit(start.len());
     fit.check()?;
     let mut rng = ChaCha8Rng::seed_from_u64(config.seed);
@@ -76,80 +89,24 @@ pub fn refine<'a>(
         Ok(outlined?.into_iter().chain(held?).collect())
     };
     let of_step = |step| coarse.as_ref().filter(|_| step < first).unwrap_or(&targets);
-    let mut stopped = false;
-    let told = |p: &FitProgress<'_>| {
-        let flow = progress(p);
-        stopped |= flow.is_break();
-        flow
-    };
-    let cloud = optimise(start, &Layer::default(), of_step, &fit, &mut rng, more, told)?;
-    if stopped || config.layer.steps == 0 {
-        return Ok(cloud);
-    }
-    let surface = Surface::of(&cloud, photos, config.hold.radius, config.layer.points)?;
-    relayer(&cloud, &surface, photos, config, progress)
+    optimise(start, of_step, &fit, &mut rng, more, progress)
 }
 
-/// The layer of [`LayerConfig`](crate::LayerConfig), which [`refine`] puts on the surface that it finds, on a known one instead: `distance` is a point's
-/// distance from it, negative inside, in the frame of the photos. It is for studies of what a better surface could bring.
+/// As [`refine`] from a layer, but on a known surface instead of the one that it finds: `distance` is a point's distance from it, negative inside, in
+/// the frame of the views. It is for studies of what a better surface could bring.
 ///
 /// # Errors
-/// As [`refine`]; also if the configuration has no layer.
-pub fn refine_on_surface(
+/// As [`refine`].
+pub fn refine_on_surface<'a>(
     cloud: &Cloud,
     distance: impl Fn(DVec3) -> f64 + Sync,
-    photos: &[View],
+    seen: impl Into<Evidence<'a>>,
     config: &RefineConfig,
     progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Cloud, FitError> {
     config.check()?;
-    let cloud = checked(cloud, usize::MAX)?;
-    if config.layer.steps == 0 {
-        return Err(Invalid::new("layer.steps", "at least 1", 0).into());
-    }
-    let surface = Surface::at(distance, config.hold.radius, config.layer.points);
-    relayer(&cloud, &surface, photos, config, progress)
-}
-
-/// Puts one opaque layer of Gaussians on `surface` where photos see it, in place of those of `cloud` that are near, and optimizes what the layer shows on
-/// the photos, held at renders of `cloud` elsewhere. `progress` hears of these steps as of a fit of their own.
-fn relayer(
-    cloud: &Cloud,
-    surface: &Surface,
-    photos: &[View],
-    config: &RefineConfig,
-    progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
-) -> Result<Cloud, FitError> {
-    let layer = &config.layer;
-    let mut seen = look(&surface.points, surface.spacing, photos)?;
-    if layer.sweep > 0.0 {
-        let points: Vec<_> = sweep(&seen, surface.spacing, layer.sweep, photos).iter().map(|s| s.point).collect();
-        seen = look(&points, surface.spacing, photos)?;
-    }
-    let (start, on) = Layer::on(cloud, &seen, surface.spacing, layer);
-    let weight = HoldConfig { weight: layer.hold, ..config.hold.clone() };
-    let mut hold = Hold::new(std::slice::from_ref(cloud), &weight)?;
-    hold.beside(&start, on.len(), HELD_LAYER)?;
-    let fit = FitConfig {
-        iterations: layer.steps,
-        growth_start: usize::MAX,
-        rates: Rates { mean: layer.mean_rate, ..config.rates },
-        opacity_regularizer: 0.0,
-        scale_regularizer: 0.0,
-        noise_lr: 0.0,
-        ..config.fit(start.len())
-    };
-    fit.check()?;
-    let targets = Targets::new(photos, config.render_size)?;
-    let mut rng = ChaCha8Rng::seed_from_u64(config.seed);
-    let mut hold_rng = ChaCha8Rng::seed_from_u64(config.seed);
-    hold_rng.set_stream(1);
-    let mut queue = Vec::new();
-    let more = |cloud: &Cloud, background| {
-        let held = next_views(&mut queue, hold.views(), 1, &mut hold_rng);
-        Ok(held.first().map(|&view| hold.objective(cloud, view, background)).transpose()?.into_iter().collect())
-    };
-    optimise(start, &on, |_| &targets, &fit, &mut rng, more, progress)
+    let field = Field::new(config.hold.radius, SIDE, distance);
+    refine_from(cloud, &[], seen.into(), config, Some(&field), progress)
 }
 
 /// As many of `clouds` as `most` Gaussians allow, but the first in any case, in one place. Each Gaussian becomes what relocation

@@ -102,7 +102,7 @@ fn psnr(cloud: &Cloud, views: &[View]) -> f64 {
     values.sum::<f64>() / views.len() as f64
 }
 
-fn go(_: &FitProgress<'_>) -> ControlFlow<()> {
+pub(crate) fn go(_: &FitProgress<'_>) -> ControlFlow<()> {
     ControlFlow::Continue(())
 }
 

@@ -58,6 +58,14 @@ impl Field {
         })
     }
 
+    /// The mean of fields on one grid.
+    pub fn mean(fields: &[Self]) -> Self {
+        let share = 1.0 / fields.len() as f32;
+        let values = (0..fields[0].values.len()).into_par_iter();
+        let values = values.map(|i| fields.iter().map(|field| share * field.values[i]).sum()).collect();
+        Self { values, ..fields[0] }
+    }
+
     /// The value at a point by linear interpolation; outside the grid that of the nearest point within.
     fn value(&self, at: DVec3) -> f64 {
         let last = (self.side - 1) as f64;
@@ -79,12 +87,15 @@ impl Field {
         DVec3::new(along(DVec3::X), along(DVec3::Y), along(DVec3::Z)) / (2.0 * self.pitch)
     }
 
-    /// About `count` points of the surface, and how far apart they are.
+    /// About `count` points of the surface, none where there is none, and how far apart they are.
     pub fn points(&self, count: usize) -> (Vec<Point>, f64) {
         let mut size = FIRST_SIZE;
         // Points go as the inverse square of the size of the cubes.
         for _ in 0..3 {
             let found = self.points_of_cubes(size).len();
+            if found == 0 {
+                return (Vec::new(), size * self.pitch);
+            }
             size = (size * (found as f64 / count as f64).sqrt()).clamp(0.25, self.side as f64 / 4.0);
         }
         (self.points_of_cubes(size), size * self.pitch)
