@@ -84,7 +84,7 @@ impl Reconstructor {
     /// # Errors
     /// If what the checkpoint says of its use cannot be read.
     pub fn gaussians(&self) -> Result<usize, Error> {
-        Ok(network_gaussians(&self.checkpoint.config, &self.checkpoint.provenance, self.checkpoint.depth)?)
+        network_gaussians(&self.checkpoint.config, &self.checkpoint.provenance, self.checkpoint.depth)
     }
 
     /// Refuses options that this model or its device cannot follow.
