@@ -17,7 +17,7 @@ pub struct MeshConfig {
     pub views: usize,
     /// Width and height of their renders, in pixels.
     pub pixels: u32,
-    /// Most triangles; `None` for as many as the voxels give, or [`TEXTURED`] with a texture.
+    /// Most triangles; `None` for as many as the voxels give, or 20,000 with a texture.
     pub triangles: Option<usize>,
     /// Width and greatest height of a texture, in texels; `None` for vertex colors.
     pub texture: Option<usize>,
