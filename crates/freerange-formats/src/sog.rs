@@ -7,14 +7,11 @@
 //! alpha the opacity. `shN_labels` has in its first two bytes the number of a row of `shN_centroids`, which holds 64 of
 //! them side by side, a pixel for each coefficient of red, green and blue, of a third codebook.
 //! Source: developer.playcanvas.com, "SOG format".
-//!
-//! Which pixel is whose is free, and what lies above a pixel predicts it: Gaussians are sorted so that the next one in a
-//! column is much like the one before.
 
 use std::io::{Cursor, Write};
 
 use freerange_splat::{RenderMode, Splats, channel, coefficients};
-use image_webp::{ColorType, EncoderParams, WebPEncoder};
+use image_webp::{ColorType, WebPEncoder};
 use serde::{Deserialize, Serialize};
 use zip::{CompressionMethod, ZipWriter, write::SimpleFileOptions};
 
@@ -88,32 +85,28 @@ pub fn encode(splats: &Splats) -> Encoded {
     let scales: Vec<f32> = codebook(all(channel::LOG_SCALE, &|v| v.into()));
     let colors: Vec<f32> = codebook(all(channel::COLOR, &sh_of_color));
 
-    let mut pixels: Vec<[[u8; 4]; 5]> = Vec::with_capacity(n);
-    let mut places: Vec<[u16; 3]> = Vec::with_capacity(n);
+    let mut pictures: [Vec<u8>; 5] = Default::default();
     for i in 0..n {
         let fixed = [0, 1, 2].map(|c| {
             let range = maxs[c] - mins[c];
             let part = if range > 0.0 { (folded(at(i, c)) - mins[c]) / range } else { 0.0 };
-            (part * 65535.0).round() as u16
+            ((part * 65535.0).round() as u16).to_le_bytes()
         });
-        places.push(fixed);
-        let fixed = fixed.map(u16::to_le_bytes);
         let q = cloud.rotation(i);
         let (largest, others) = smallest_three([q.w, q.x, q.y, q.z]);
         let others = others.map(|v| byte((v * std::f64::consts::SQRT_2 * 0.5 + 0.5) * 255.0));
-        pixels.push([
+        let pixels = [
             opaque(fixed.map(|b| b[0])),
             opaque(fixed.map(|b| b[1])),
             [others[0], others[1], others[2], 252 + largest as u8],
             opaque([3, 4, 5].map(|c| nearest(&scales, at(i, c)))),
             with_alpha([11, 12, 13].map(|c| nearest(&colors, sh_of_color(cloud.row(i)[c]))), unorm8(cloud.opacity(i))),
-        ]);
+        ];
+        pictures.iter_mut().zip(pixels).for_each(|(picture, pixel)| picture.extend(pixel));
     }
-    let order = order(&places, &pixels);
-    let picture = |k: usize| square(order.iter().map(|&i| pixels[i][k]));
     let names = ["means_l.webp", "means_u.webp", "quats.webp", "scales.webp", "sh0.webp"].map(String::from);
     let [low, high, quats, scale_name, color_name] = names.clone();
-    let mut files: Vec<(String, Vec<u8>)> = names.into_iter().enumerate().map(|(k, name)| (name, picture(k))).collect();
+    let mut files: Vec<(String, Vec<u8>)> = names.into_iter().zip(pictures.map(|p| square(p, n))).collect();
     let meta = Meta {
         version: 2,
         model: match splats.mode {
@@ -126,7 +119,7 @@ pub fn encode(splats: &Splats) -> Encoded {
         scales: Coded { codebook: scales, files: [scale_name] },
         quats: Files { files: [quats] },
         sh0: Coded { codebook: colors, files: [color_name] },
-        harmonics: harmonics(splats, &order, &mut files),
+        harmonics: harmonics(splats, &mut files),
     };
     files.insert(0, ("meta.json".into(), serde_json::to_vec(&meta).expect("finite numbers and strings")));
     Encoded { bytes: archive(&files), notes: Vec::new() }
@@ -137,8 +130,8 @@ pub const ANTIALIASED: &str = "antialiased";
 pub const FLAT: &str = "2dgs";
 
 /// Adds the pictures of harmonics, where there are any.
-fn harmonics(splats: &Splats, order: &[usize], files: &mut Vec<(String, Vec<u8>)>) -> Option<Harmonic> {
-    let width = splats.harmonics.width();
+fn harmonics(splats: &Splats, files: &mut Vec<(String, Vec<u8>)>) -> Option<Harmonic> {
+    let (n, width) = (splats.cloud.len(), splats.harmonics.width());
     if width == 0 {
         return None;
     }
@@ -150,9 +143,9 @@ fn harmonics(splats: &Splats, order: &[usize], files: &mut Vec<(String, Vec<u8>)
     rows.as_chunks::<3>().0.iter().for_each(|c| centroids.extend(opaque(c.map(|v| nearest(&codes, v.into())))));
     centroids.resize(4 * each * count.next_multiple_of(CENTROIDS), 0);
     let picture = webp(&centroids, each * CENTROIDS, count.div_ceil(CENTROIDS));
-    let pixels = order.iter().map(|&i| labels[i]).map(|l| opaque([l as u8, (l >> 8) as u8, 0]));
+    let pixels = labels.iter().flat_map(|l| opaque([*l as u8, (l >> 8) as u8, 0])).collect();
     let names = ["shN_centroids.webp", "shN_labels.webp"].map(String::from);
-    files.extend(names.iter().cloned().zip([picture, square(pixels)]));
+    files.extend(names.iter().cloned().zip([picture, square(pixels, n)]));
     Some(Harmonic { count: count as u64, bands: splats.harmonics.degree(), codebook: codes, files: names })
 }
 
@@ -211,88 +204,20 @@ fn palette(data: &[f32], width: usize) -> (Vec<u16>, Vec<f32>) {
     (labels, rows)
 }
 
-/// Among how many that come next along the curve the one most like the last is looked for.
-const WINDOW: usize = 64;
-/// How much a step in the high byte of a coordinate counts beside one in another byte.
-const NEAR: u16 = 16;
-
-/// The order that Gaussians are written in: along a Hilbert curve, and of the next [`WINDOW`] on it always the one whose
-/// bytes differ least from those of the one before.
-fn order(places: &[[u16; 3]], pixels: &[[[u8; 4]; 5]]) -> Vec<usize> {
-    let mut curve: Vec<usize> = (0..places.len()).collect();
-    curve.sort_by_cached_key(|&i| hilbert(places[i]));
-    // What differs: positions, and the bytes of the other pictures.
-    let features = |i: usize| {
-        let mut all = [0u16; 16];
-        let others = pixels[i][2..].iter().flatten().map(|byte| u16::from(*byte));
-        all.iter_mut().zip(places[i].map(|v| v / (256 / NEAR)).into_iter().chain(others)).for_each(|(f, v)| *f = v);
-        all
-    };
-    let apart = |a: &[u16; 16], b: &[u16; 16]| a.iter().zip(b).map(|(x, y)| x.abs_diff(*y)).sum::<u16>();
-    let mut coming = curve.into_iter().map(|i| (features(i), i));
-    let mut window: Vec<([u16; 16], usize)> = coming.by_ref().take(WINDOW).collect();
-    let mut order: Vec<usize> = Vec::with_capacity(places.len());
-    let mut last = window.first().map_or([0; 16], |(first, _)| *first);
-    while let Some(next) = (0..window.len()).min_by_key(|&k| apart(&last, &window[k].0)) {
-        let (found, i) = window.swap_remove(next);
-        last = found;
-        order.push(i);
-        window.extend(coming.next());
-    }
-    order
-}
-
-/// The place along a curve through a cube of 2^16 that always goes on to a neighbor (J. Skilling, 2004).
-fn hilbert(place: [u16; 3]) -> u64 {
-    let mut x = place;
-    let mut bit = 1u16 << 15;
-    while bit > 1 {
-        let below = bit - 1;
-        for k in 0..3 {
-            if x[k] & bit != 0 {
-                x[0] ^= below;
-            } else {
-                let swapped = (x[0] ^ x[k]) & below;
-                x[0] ^= swapped;
-                x[k] ^= swapped;
-            }
-        }
-        bit >>= 1;
-    }
-    x[1] ^= x[0];
-    x[2] ^= x[1];
-    let mut flips = 0;
-    for bit in (1..16).map(|k| 1u16 << k).filter(|bit| x[2] & bit != 0) {
-        flips ^= bit - 1;
-    }
-    (0..16).rev().flat_map(|bit| x.map(|v| u64::from((v ^ flips) >> bit & 1))).fold(0, |key, bit| key << 1 | bit)
-}
-
-/// Pixels, column by column, as a picture as near to a square as whole blocks of four pixels allow. Those that there are
-/// fill its first rows.
-fn square(pixels: impl ExactSizeIterator<Item = [u8; 4]>) -> Vec<u8> {
-    let n = pixels.len();
+/// Pixels of `n` Gaussians as a picture as near to a square as whole blocks of four pixels allow.
+fn square(mut pixels: Vec<u8>, n: usize) -> Vec<u8> {
     let width = ((n as f64).sqrt().ceil() as usize).next_multiple_of(4);
     let height = n.div_ceil(width).next_multiple_of(4);
-    let mut picture = vec![[0; 4]; width * height];
-    let places = (0..width).flat_map(|x| (x..n).step_by(width));
-    places.zip(pixels).for_each(|(place, pixel)| picture[place] = pixel);
-    webp(picture.as_flattened(), width, height)
+    pixels.resize(4 * width * height, 0);
+    webp(&pixels, width, height)
 }
 
-/// With each pixel predicted by the one above, or not: whichever is smaller.
 fn webp(pixels: &[u8], width: usize, height: usize) -> Vec<u8> {
-    let encoded = [true, false].map(|predicted| {
-        let mut bytes = Vec::new();
-        let mut encoder = WebPEncoder::new(&mut bytes);
-        let mut params = EncoderParams::default();
-        params.use_predictor_transform = predicted;
-        encoder.set_params(params);
-        let encoded = encoder.encode(pixels, width as u32, height as u32, ColorType::Rgba8);
-        encoded.expect("a picture of at most 4096 pixels' side");
-        bytes
-    });
-    encoded.into_iter().min_by_key(Vec::len).expect("two")
+    let mut bytes = Vec::new();
+    let encoder = WebPEncoder::new(&mut bytes);
+    let encoded = encoder.encode(pixels, width as u32, height as u32, ColorType::Rgba8);
+    encoded.expect("a picture of at most 4096 pixels' side");
+    bytes
 }
 
 fn archive(files: &[(String, Vec<u8>)]) -> Vec<u8> {
@@ -431,30 +356,6 @@ mod tests {
             / 10_000.0;
         let even = (1.0 / 256f64).powi(2) / 12.0;
         assert!(error < 1.001 * even, "{error} {even}");
-    }
-
-    #[test]
-    fn the_curve_goes_on_to_neighbors_and_visits_each_place_once() {
-        // Of every eighth of the cube, those at its corner nearest to the origin: a curve through 8 x 8 x 8.
-        let mut places: Vec<[u16; 3]> = (0..512u16).map(|i| [i & 7, i >> 3 & 7, i >> 6].map(|v| v << 13)).collect();
-        places.sort_by_key(|p| hilbert(*p));
-        let apart = |a: &[u16; 3], b: &[u16; 3]| (0..3).map(|k| u32::from(a[k].abs_diff(b[k])) >> 13).sum::<u32>();
-        assert!(places.windows(2).all(|w| apart(&w[0], &w[1]) == 1), "{places:?}");
-        assert_eq!(hilbert([0; 3]), 0);
-    }
-
-    #[test]
-    fn every_gaussian_is_written_once_beside_similar_ones() {
-        let places: Vec<[u16; 3]> = (0..1000u32).map(|i| [7919, 104_729, 1_299_709].map(|p| (i * p) as u16)).collect();
-        let pixels: Vec<[[u8; 4]; 5]> = places.iter().map(|p| [[(p[0] >> 8) as u8; 4]; 5]).collect();
-        let found = order(&places, &pixels);
-        let mut sorted = found.clone();
-        sorted.sort_unstable();
-        assert!(sorted.iter().enumerate().all(|(i, k)| i == *k));
-        let steps = |order: &[usize]| {
-            order.windows(2).map(|w| u64::from(pixels[w[0]][2][0].abs_diff(pixels[w[1]][2][0]))).sum::<u64>()
-        };
-        assert!(steps(&found) * 2 < steps(&sorted), "{} {}", steps(&found), steps(&sorted));
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! An object without any symmetry, and how near two clouds are.
 #![allow(dead_code, reason = "each test uses a part")]
 
-use freerange_splat::{Cloud, Splats, channel};
+use freerange_splat::{Cloud, channel};
 use glam::DQuat;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -48,19 +48,6 @@ pub fn difference(a: &Cloud, b: &Cloud) -> Difference {
         opacity: most(&|i| (a.opacity(i) - b.opacity(i)).abs()),
         color: most(&|i| (a.color(i) - b.color(i)).abs().max_element()),
     }
-}
-
-/// Those of `found` in the order of `wanted`: formats may sort. Each is the nearest to one that is wanted.
-pub fn in_order(wanted: &Cloud, found: &Splats) -> Splats {
-    let nearest = |i: usize| {
-        let apart = |j: &usize| found.cloud.mean(*j).distance_squared(wanted.mean(i));
-        (0..found.cloud.len()).min_by(|a, b| apart(a).total_cmp(&apart(b))).unwrap()
-    };
-    let order: Vec<usize> = (0..wanted.len()).map(nearest).collect();
-    let mut each = order.clone();
-    each.sort_unstable();
-    assert!(each.iter().enumerate().all(|(i, k)| i == *k) && each.len() == found.cloud.len(), "each is found once");
-    found.select(&order)
 }
 
 /// Of the rotation between two orientations, of which half turns about a Gaussian's own axes change nothing. 2 asin is
