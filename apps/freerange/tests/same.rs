@@ -10,7 +10,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use freerange::{Choices, Cloud, Detect, Device, Reconstructor, Scene, write_ply};
+use freerange::{Choices, Cloud, Detect, Device, Options, Reconstruction, Reconstructor, Scene, write_ply};
 use serde_json::Value;
 
 fn bowl() -> PathBuf {
@@ -19,6 +19,22 @@ fn bowl() -> PathBuf {
 
 /// Quick, and away from the defaults.
 const ITERATIONS: usize = 6;
+
+/// What the library makes of the bowl with these settings, and all of them.
+fn of_library() -> (Options, Reconstruction) {
+    let model = Reconstructor::shipped(&Device::flex()).unwrap();
+    let scene = Scene::open(&bowl()).unwrap();
+    let choices = Choices {
+        iterations: Some(ITERATIONS),
+        symmetry: Some(Detect::Off),
+        set: vec![("propose.count".into(), "2".into())],
+        ..Choices::default()
+    };
+    let mut options = model.options_of(&choices).unwrap();
+    (options.seeds, options.frame) = (vec![3], scene.frame);
+    let made = model.run(scene.views(), &options, &mut |_| std::ops::ControlFlow::Continue(())).unwrap();
+    (options, made)
+}
 
 #[test]
 fn the_library_gives_what_the_program_gives() {
@@ -30,17 +46,7 @@ fn the_library_gives_what_the_program_gives() {
     let done = Command::new(env!("CARGO_BIN_EXE_freerange")).args(command).args(options).output().unwrap();
     assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
 
-    let model = Reconstructor::shipped(&Device::flex()).unwrap();
-    let scene = Scene::open(&scene).unwrap();
-    let choices = Choices {
-        iterations: Some(ITERATIONS),
-        symmetry: Some(Detect::Off),
-        set: vec![("propose.count".into(), "2".into())],
-        ..Choices::default()
-    };
-    let mut options = model.options_of(&choices).unwrap();
-    (options.seeds, options.frame) = (vec![3], scene.frame);
-    let made = model.run(scene.views(), &options, &mut |_| std::ops::ControlFlow::Continue(())).unwrap();
+    let (options, made) = of_library();
     let own = place.path().join("own.ply");
     write_ply(&made.samples[0].gaussians, &own).unwrap();
     assert_eq!(fs::read(own).unwrap(), fs::read(out.join("gaussians.ply")).unwrap());
@@ -115,17 +121,7 @@ fn the_page_gives_what_the_library_gives() {
     assert_eq!(status, 200);
     let rows: Vec<f32> = rows.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
 
-    let model = Reconstructor::shipped(&Device::flex()).unwrap();
-    let scene = Scene::open(&bowl()).unwrap();
-    let choices = Choices {
-        iterations: Some(ITERATIONS),
-        symmetry: Some(Detect::Off),
-        set: vec![("propose.count".into(), "2".into())],
-        ..Choices::default()
-    };
-    let mut options = model.options_of(&choices).unwrap();
-    (options.seeds, options.frame) = (vec![3], scene.frame);
-    let made = model.run(scene.views(), &options, &mut |_| std::ops::ControlFlow::Continue(())).unwrap();
+    let (_, made) = of_library();
     let expected: &Cloud = &made.samples[0].gaussians;
     // The server keeps results in a file, in which colors are rounded.
     assert_eq!(rows.len(), expected.rows().len());

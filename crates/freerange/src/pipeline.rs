@@ -1,6 +1,6 @@
 //! The main job, posed photos to Gaussians, in five steps.
 //!
-//! 1. [`canonical`](self): the user's frame becomes the canonical one, in which the object lies within radius 0.5 about the
+//! 1. Canonicalize: the user's frame becomes the canonical one, in which the object lies within radius 0.5 about the
 //!    origin with +z up; photos are cropped to the object, and views for the network are chosen.
 //! 2. Symmetry: with up to four photos, a mirror plane adds mirrored photos to the targets, an axis of revolution adds
 //!    rotated silhouettes ([`SymmetryConfig`](crate::SymmetryConfig)).

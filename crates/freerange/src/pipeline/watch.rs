@@ -40,7 +40,7 @@ impl<'a> Watch<'a> {
         }
     }
 
-    /// Does a step of the pipeline and counts its time, if it reported anything.
+    /// Does a step of the pipeline and adds its time to that of its stage.
     pub fn timed<T>(&mut self, stage: Stage, step: impl FnOnce(&mut Self) -> Result<T, Error>) -> Result<T, Error> {
         let begin = Instant::now();
         let done = step(self)?;
