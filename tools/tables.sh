@@ -11,6 +11,8 @@
 # FREERANGE_SHARED names the folder of the 21 objects (../shared); without it they are left out, with a line that says so.
 # WEIGHTS names the folder of LPIPS's weights (tools/lpips_weights.py makes it); without it LPIPS and the Frechet distance
 # are reported as not computed.
+# PART=4 trains every row on a quarter of the samples (its steps, warmup and the window of the averaged weights);
+# OBJECTS and GENERATED are the numbers of objects to train on and to evaluate. What was chosen stands in the tables.
 # On two idle cores of an AMD EPYC with AVX-512 BF16 the objects take 45 minutes, a row about as long, and its evaluation
 # half of that (estimated).
 set -euo pipefail
@@ -20,14 +22,23 @@ shift 2
 cd "$(dirname "$0")/.."
 rows=("$@")
 [ ${#rows[@]} -gt 0 ] || rows=(full full_seed2 no_flow_matching no_rendering no_curriculum no_patching_half no_patching
-  random_patches no_gradient_channels pixel_aligned voxel_aligned tree_coupling pipeline)
-objects=${OBJECTS:-3072} generated=${GENERATED:-100} steps=${STEPS:-} # smaller ones try the script
+  random_patches no_gradient_channels pixel_aligned voxel_aligned test_time tree_coupling pipeline)
+objects=${OBJECTS:-3072} generated=${GENERATED:-100} part=${PART:-1}
 shared=${FREERANGE_SHARED:-../shared}
 
 mkdir -p "$place/rows" "$place/runs"
 mkdir -p "$place/configs/tables" && cp configs/tables/*.toml "$place/configs/tables/"
-if [ -n "$steps" ]; then
-  sed -i -E "s/steps = [0-9]{4}/steps = $steps/" "$place"/configs/tables/*.toml
+if [ "$part" != 1 ]; then
+  python3 - "$part" "$place"/configs/tables/*.toml <<'PYTHON'
+import re, sys
+part = float(sys.argv[1])
+shorter = lambda m: m[1] + str(max(1, round(int(m[2]) / part)))
+for path in sys.argv[2:]:
+    text = open(path).read()
+    text = re.sub(r"\b((?:steps|warmup) = )(\d{3,})", shorter, text)
+    text = re.sub(r"(?m)^ema = (.*)", lambda m: f"ema = {1 - part * (1 - float(m[1])):.6g}", text)
+    open(path, "w").write(text)
+PYTHON
 fi
 echo "== objects"
 "$binary" data generate --objects "$objects" --first-seed 41000000 --gaussians fit --depths 7,8,9,10 \
@@ -51,8 +62,27 @@ evaluate() {
   "$binary" eval --pictures none "${from[@]}" "$@"
 }
 
+# Full's checkpoint at other settings, on half of the objects: differences are paired.
+test_time() {
+  local out=$place/rows/full checkpoint=$place/runs/full/checkpoint.safetensors half=$(((generated + 1) / 2))
+  for source in "$half" objects; do
+    evaluate "$checkpoint" "$out/no-cfg" "$source" --metrics psnr,ssim --set propose.flow.cfg_scale=1
+    evaluate "$checkpoint" "$out/no-photometric" "$source" --metrics psnr,ssim --set propose.flow.lambda_pg=0
+  done
+  for inputs in 2 6 9; do # the 21 have at most seven views to choose from
+    evaluate "$checkpoint" "$out/inputs-$inputs" "$half" --metrics psnr,ssim --views full --inputs "$inputs"
+  done
+  # A mean is smooth, a sample is sharp.
+  evaluate "$checkpoint" "$out/four-samples" "$half" --metrics psnr,frechet-vgg --views partial --samples 4
+}
+
 for row in "${rows[@]}"; do
   echo "== $row"
+  if [ "$row" = test_time ]; then
+    test_time
+    "$binary" eval paper-tables "$place/rows" --keep docs/results/paper-tables -o docs/results/paper-tables/tables.md
+    continue
+  fi
   run=$place/runs/$row out=$place/rows/$row checkpoint=$place/runs/$row/checkpoint.safetensors
   mkdir -p "$out"
   if [ "$row" = pipeline ]; then
@@ -67,18 +97,5 @@ for row in "${rows[@]}"; do
   for source in "$generated" objects; do
     evaluate "$checkpoint" "$out" "$source" --metrics "$metrics"
   done
-  if [ "$row" = full ]; then
-    # Of test time, on fewer objects: differences are paired.
-    half=$(((generated + 1) / 2))
-    for source in "$half" objects; do
-      evaluate "$checkpoint" "$out/no-cfg" "$source" --metrics psnr,ssim --set propose.flow.cfg_scale=1
-      evaluate "$checkpoint" "$out/no-photometric" "$source" --metrics psnr,ssim --set propose.flow.lambda_pg=0
-    done
-    for inputs in 2 6 9; do # the 21 have at most seven views to choose from
-      evaluate "$checkpoint" "$out/inputs-$inputs" "$half" --metrics psnr,ssim --views full --inputs "$inputs"
-    done
-    # A mean is smooth, a sample is sharp.
-    evaluate "$checkpoint" "$out/four-samples" "$half" --metrics psnr,frechet-vgg --views partial --samples 4
-  fi
   "$binary" eval paper-tables "$place/rows" --keep docs/results/paper-tables -o docs/results/paper-tables/tables.md
 done
