@@ -2,10 +2,8 @@
 
 use std::error::Error;
 
-use freerange_formats::FormatError;
 use freerange_hub::HubError;
 use freerange_raster::RasterError;
-use freerange_scene::SceneError;
 use pyo3::{
     PyErr,
     exceptions::{PyOSError, PyRuntimeError, PyValueError},
@@ -27,25 +25,33 @@ fn told(error: &(dyn Error + 'static)) -> String {
     text
 }
 
-/// `OSError` where the system refused a file, else `ValueError`.
-fn about_input(error: &(dyn Error + 'static)) -> PyErr {
+/// `OSError` where the system refused a file.
+fn of_system(error: &(dyn Error + 'static)) -> Option<PyErr> {
     let mut next = Some(error);
     while let Some(e) = next {
         if let Some(io) = e.downcast_ref::<std::io::Error>() {
-            return match io.raw_os_error() {
+            return Some(match io.raw_os_error() {
                 // With a number Python chooses the subclass: FileNotFoundError, PermissionError, ...
                 Some(number) => PyOSError::new_err((number, told(error))),
                 None => PyOSError::new_err(told(error)),
-            };
+            });
         }
         next = e.source();
     }
-    PyValueError::new_err(told(error))
+    None
+}
+
+/// `OSError` where the system refused a file, else `ValueError`.
+fn about_input(error: &(dyn Error + 'static)) -> PyErr {
+    of_system(error).unwrap_or_else(|| PyValueError::new_err(told(error)))
 }
 
 /// What the caller gave is to blame (`ValueError`, `OSError`), or a device or the arithmetic (`RuntimeError`).
 pub fn of_model(error: freerange::Error) -> PyErr {
-    if error.is_failure() { PyRuntimeError::new_err(told(&error)) } else { about_input(&error) }
+    match error.is_failure() {
+        true => of_system(&error).unwrap_or_else(|| PyRuntimeError::new_err(told(&error))),
+        false => about_input(&error),
+    }
 }
 
 /// A name that is none, else what lies between here and the hub.
@@ -56,11 +62,7 @@ pub fn of_hub(error: HubError) -> PyErr {
     }
 }
 
-macro_rules! about_input {
-    ($($name:ident($error:ty))*) => {$(
-        pub fn $name(error: $error) -> PyErr {
-            about_input(&error)
-        }
-    )*};
+/// Cameras or Gaussians that cannot be rendered.
+pub fn of_raster(error: RasterError) -> PyErr {
+    about_input(&error)
 }
-about_input!(of_format(FormatError) of_raster(RasterError) of_scene(SceneError));

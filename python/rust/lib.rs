@@ -29,7 +29,7 @@ mod _core {
     /// Every device, the best first: name, hardware, and why it cannot be used if it cannot.
     #[pyfunction]
     fn devices(py: Python<'_>) -> Vec<(String, String, Option<String>)> {
-        let found = py.detach(freerange::devices);
+        let found = py.detach(freerange::Device::list);
         found.into_iter().map(|d| (d.name, d.properties.hardware, d.problem)).collect()
     }
 }

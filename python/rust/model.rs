@@ -8,16 +8,16 @@ use std::{
 };
 
 use freerange::{
-    DeviceName, EncoderPlaces, FrameConfig, Options, Reconstructor, View, machine::cache_folder, others_show,
+    DeviceName, EncoderPlaces, FrameConfig, Hints, Options, Reconstructor, View, cut_out, internal::shipped,
+    machine::cache_folder,
 };
 use freerange_hub::Hub;
-use freerange_scene::{cut, estimate::Hints};
 use glam::DVec3;
 use pyo3::{prelude::*, types::PyByteArray};
 
 use crate::{
     arguments::{RawOptions, RawUp, RawView, refuse, told, views},
-    error::{of_hub, of_model, of_scene},
+    error::{of_hub, of_model},
     raster::bytes,
     scene::Scene,
 };
@@ -46,7 +46,7 @@ pub fn load(
     py.detach(|| {
         let opened = name.open().map_err(of_model)?;
         let model = match &checkpoint {
-            None => Reconstructor::shipped(&opened),
+            None => shipped(&opened),
             Some(path) => Reconstructor::load(&local(path)?, &EncoderPlaces::at(encoder_weights), &opened),
         };
         Ok(Model { model: model.map_err(of_model)?, device: name.to_string() })
@@ -87,7 +87,7 @@ impl Model {
     /// What the checkpoint says of its making, as JSON.
     #[getter]
     fn provenance(&self) -> String {
-        self.model.checkpoint().provenance.to_string()
+        self.model.provenance().to_string()
     }
 
     /// Samples for views in memory.
@@ -108,9 +108,9 @@ impl Model {
         options.frame = FrameConfig { up, center, radius, ..FrameConfig::default() };
         let notes = py.detach(|| {
             self.model.check(&options).map_err(of_model)?;
-            cut(&mut views, &Hints { center, radius, others: Some(others_show) })
+            cut_out(&mut views, &Hints { center, radius, ..Hints::default() })
                 .map(|notes| notes.into_iter().map(|note| note.text).collect())
-                .map_err(of_scene)
+                .map_err(of_model)
         })?;
         self.run(py, &views, &options, notes, on_step)
     }
@@ -168,8 +168,7 @@ impl Model {
         stopped?;
         let result = result.map_err(of_model)?;
         let samples = result.samples.iter().map(|s| bytes(py, s.gaussians.rows())).collect();
-        // The canonical frame has +z up.
-        let up = (result.canonical_from_user.rotation.inverse() * DVec3::Z).to_array();
+        let up = result.up().to_array();
         notes.extend(result.notes.into_iter().map(|note| note.text));
         Ok((samples, up, notes, result.seconds.iter().map(|(stage, s)| (stage.name(), *s)).collect()))
     }

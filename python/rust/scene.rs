@@ -2,15 +2,13 @@
 
 use std::path::PathBuf;
 
-use freerange::{Cloud, Hints, LoadConfig, MaskSource, ReadConfig, SceneConfig, View, write_ply};
-use freerange_formats::{Format as FileFormat, Frame, WriteOptions};
-use freerange_scene::read::{Format, Turntable};
+use freerange::{CameraFormat, Cloud, Hints, LoadConfig, MaskSource, Note, ReadConfig, SceneConfig, Turntable, View};
 use glam::DVec3;
 use pyo3::{prelude::*, pybacked::PyBackedBytes, types::PyByteArray};
 
 use crate::{
     arguments::{RawCamera, RawUp, floats, raw_camera, refuse, told},
-    error::{of_format, of_model},
+    error::of_model,
     raster::bytes,
 };
 
@@ -39,7 +37,7 @@ pub struct Photos {
 #[pyfunction]
 pub fn read_scene(py: Python<'_>, path: PathBuf, photos: Photos, up: RawUp) -> PyResult<Scene> {
     let format = photos.cameras.map(|name| {
-        let known = Format::ALL.into_iter().find(|f| f.name() == name);
+        let known = CameraFormat::ALL.into_iter().find(|f| f.name() == name);
         let expected = "'transforms', 'colmap', 'polycam', 'metashape', 'realitycapture' or 'opf'";
         known.ok_or_else(|| refuse("cameras", expected, format!("'{name}'")))
     });
@@ -100,34 +98,22 @@ impl Scene {
     }
 }
 
-/// The frame in which `up` is up.
-fn frame(up: [f64; 3]) -> PyResult<Frame> {
-    Frame::with_up(up.into()).ok_or_else(|| refuse("up", "a direction", format!("{up:?}")))
+fn texts(notes: Vec<Note>) -> Vec<String> {
+    notes.into_iter().map(|note| note.text).collect()
 }
 
 /// Writes Gaussians in the format of the file's extension; what the format could not hold.
 #[pyfunction]
 pub fn write_gaussians(py: Python<'_>, rows: PyBackedBytes, path: PathBuf, up: [f64; 3]) -> PyResult<Vec<String>> {
     let cloud = cloud(&rows)?;
-    let options = WriteOptions { frame: frame(up)?, ..WriteOptions::default() };
-    py.detach(|| match FileFormat::of(&path)? {
-        // The bytes that `freerange reconstruct` writes.
-        FileFormat::Ply => Ok(write_ply(&cloud, &path).map(|()| Vec::new())?),
-        _ => freerange_formats::write(&cloud.into(), &path, &options),
-    })
-    .map_err(of_format)
+    py.detach(|| freerange::write_gaussians(&cloud, &path, up.into())).map(texts).map_err(of_model)
 }
 
 /// Reads Gaussians from a file; those that fix their frame are turned into the one in which `up` is up.
 #[pyfunction]
 pub fn read_gaussians(py: Python<'_>, path: PathBuf, up: [f64; 3]) -> PyResult<(Py<PyByteArray>, Vec<String>)> {
-    let frame = frame(up)?;
-    let mut loaded = py.detach(|| freerange_formats::read(&path, frame)).map_err(of_format)?;
-    let degree = loaded.splats.harmonics.degree();
-    if degree > 0 {
-        loaded.notes.push(format!("color that depends on the viewing direction (degree {degree}) is left out"));
-    }
-    Ok((bytes(py, loaded.splats.into_cloud().rows()), loaded.notes))
+    let (cloud, notes) = py.detach(|| freerange::read_gaussians(&path, up.into())).map_err(of_model)?;
+    Ok((bytes(py, cloud.rows()), texts(notes)))
 }
 
 fn cloud(rows: &[u8]) -> PyResult<Cloud> {

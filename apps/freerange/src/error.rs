@@ -1,8 +1,9 @@
 //! One error for the command line: the chain of causes, and the exit code.
 
-use std::{error::Error, fmt, io, path::Path};
+use std::{error::Error, fmt, path::Path};
 
 use freerange_build::BuildError;
+use freerange_core::system_failed;
 use freerange_data::DataError;
 use freerange_fit::FitError;
 use freerange_flow::FlowError;
@@ -80,37 +81,7 @@ impl fmt::Display for CliError {
 /// The exit code of an error that is not known more closely: 1 where the system failed, 2 where what was given cannot be
 /// used.
 fn code_of(error: &(dyn Error + 'static)) -> u8 {
-    let mut next = Some(error);
-    while let Some(e) = next {
-        let io = match e.downcast_ref::<image::ImageError>() {
-            Some(image::ImageError::IoError(io)) => Some(io),
-            _ => e.downcast_ref(),
-        };
-        if io.is_some_and(|io| !is_about_input(io.kind())) {
-            return 1;
-        }
-        next = e.source();
-    }
-    2
-}
-
-/// Whether another path, or another file there, would help; full disks, lost connections and the like are not of this kind.
-fn is_about_input(kind: io::ErrorKind) -> bool {
-    use io::ErrorKind as K;
-    matches!(
-        kind,
-        K::NotFound
-            | K::PermissionDenied
-            | K::AlreadyExists
-            | K::IsADirectory
-            | K::NotADirectory
-            | K::DirectoryNotEmpty
-            | K::ReadOnlyFilesystem
-            | K::InvalidFilename
-            | K::InvalidInput
-            | K::InvalidData
-            | K::UnexpectedEof
-    )
+    if system_failed(error) { 1 } else { 2 }
 }
 
 impl From<FlowError> for CliError {
@@ -131,13 +102,7 @@ impl From<FlowError> for CliError {
 
 impl From<freerange::Error> for CliError {
     fn from(e: freerange::Error) -> Self {
-        use freerange::Error as E;
-        match e {
-            E::Flow(e) => e.into(),
-            E::Fit(e) => e.into(),
-            E::Cancelled | E::BrokenDevice(_) => Self::failure(e),
-            _ => Self { code: code_of(&e), source: e.into(), agreed: false },
-        }
+        if e.is_failure() { Self::failure(e) } else { Self::input(e) }
     }
 }
 
@@ -199,6 +164,8 @@ other_errors!(
 
 #[cfg(test)]
 mod tests {
+    use std::io;
+
     use freerange_core::IoError;
 
     use super::*;

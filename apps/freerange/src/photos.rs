@@ -9,8 +9,8 @@ use freerange::{Scene, SceneConfig, Up};
 use freerange_scene::{
     LoadConfig, MaskModel, MaskSource, PixelRange,
     estimate::Hints,
-    files, load,
-    read::{Cameras, Format, ReadConfig, Turntable, cameras, cameras_with},
+    files,
+    read::{Cameras, Format, ReadConfig, Turntable, cameras_with},
 };
 use glam::DVec3;
 
@@ -188,18 +188,5 @@ impl Photos {
             UpChoice::Auto => None,
         };
         Ok(Scene::load(cameras, &SceneConfig { photos: self.config(), up, ..SceneConfig::default() })?)
-    }
-
-    /// Reads views that are only compared with: all of a scene's, relative to the same origin as those that they are compared with.
-    pub fn further(scene: &Path, origin: DVec3) -> Result<Vec<freerange::View>, CliError> {
-        let mut cameras = cameras(scene, None, None)?;
-        cameras.subtract(origin);
-        let loaded = load(&cameras, &LoadConfig::default())?;
-        if loaded.estimate.is_some() {
-            let what =
-                "expected views to compare with that have masks (alpha, files, or a plain background), found none";
-            return Err(CliError::file(scene, what));
-        }
-        Ok(loaded.views.into_iter().chain(loaded.further).collect())
     }
 }

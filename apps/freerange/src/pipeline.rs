@@ -4,7 +4,7 @@ use std::{path::PathBuf, str::FromStr};
 
 use freerange::{
     Choices, Compute, Detect, Device, DeviceName, EncoderPlaces, Init, Options, Quality, Reconstructor,
-    checkpoint_sha256,
+    internal::{checkpoint_sha256, shipped},
 };
 
 use crate::{
@@ -140,7 +140,7 @@ impl PipelineArgs {
     pub fn open(&self, device: &Device) -> Result<Reconstructor, CliError> {
         Ok(match &self.checkpoint {
             Some(path) => Reconstructor::load(&local(path)?, &EncoderPlaces::at(self.encoder_weights.clone()), device)?,
-            None => Reconstructor::shipped(device)?,
+            None => shipped(device)?,
         })
     }
 

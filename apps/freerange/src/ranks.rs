@@ -102,7 +102,7 @@ impl Job {
     ///
     /// # Errors
     /// Where NCCL is asked for and cannot be used, on any rank.
-    pub fn sums(&self, how: Sums, device: &Device) -> Result<Rc<dyn Ranks>, CliError> {
+    pub fn sums(&self, how: Sums, device: &burn::tensor::Device) -> Result<Rc<dyn Ranks>, CliError> {
         match how {
             Sums::Host => Ok(self.ranks.clone()),
             #[cfg(feature = "nccl")]

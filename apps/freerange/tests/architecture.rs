@@ -63,6 +63,7 @@ const ROOMS: &[(&str, &[&str])] = &[
         &[
             "freerange-core",
             "freerange-splat",
+            "freerange-formats",
             "freerange-camera",
             "freerange-scene",
             "freerange-raster",
@@ -90,8 +91,6 @@ const ROOMS: &[(&str, &[&str])] = &[
         &[
             "freerange-camera",
             "freerange-raster",
-            "freerange-scene",
-            "freerange-formats",
             "freerange-hub",
             "freerange",
             // For their features alone.

@@ -158,7 +158,7 @@ fn tensors(run: &str) -> Vec<u8> {
 }
 
 fn sha256(encoder: &str) -> String {
-    let encoder = freerange_model::Dinov2::load(Path::new(encoder), &freerange::Device::flex()).unwrap();
+    let encoder = freerange_model::Dinov2::load(Path::new(encoder), &burn::tensor::Device::flex()).unwrap();
     encoder.origin().unwrap().sha256.clone()
 }
 

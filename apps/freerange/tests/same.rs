@@ -10,7 +10,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use freerange::{Choices, Cloud, Detect, Device, Options, Reconstruction, Reconstructor, Scene, write_ply};
+use freerange::{Choices, Cloud, Detect, Device, Options, Reconstruction, Reconstructor, Scene};
 use serde_json::Value;
 
 fn bowl() -> PathBuf {
@@ -22,7 +22,7 @@ const ITERATIONS: usize = 6;
 
 /// What the library makes of the bowl with these settings, and all of them.
 fn of_library() -> (Options, Reconstruction) {
-    let model = Reconstructor::shipped(&Device::flex()).unwrap();
+    let model = Reconstructor::shipped(&Device::cpu()).unwrap();
     let scene = Scene::open(&bowl()).unwrap();
     let choices = Choices {
         iterations: Some(ITERATIONS),
@@ -48,7 +48,7 @@ fn the_library_gives_what_the_program_gives() {
 
     let (options, made) = of_library();
     let own = place.path().join("own.ply");
-    write_ply(&made.samples[0].gaussians, &own).unwrap();
+    made.write(&own).unwrap();
     assert_eq!(fs::read(own).unwrap(), fs::read(out.join("gaussians.ply")).unwrap());
     let report: Value = serde_json::from_slice(&fs::read(out.join("report.json")).unwrap()).unwrap();
     assert_eq!(report["pipeline"], serde_json::to_value(&options.pipeline).unwrap());

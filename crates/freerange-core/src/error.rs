@@ -1,3 +1,4 @@
+use std::error::Error;
 use std::fmt::Debug;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -53,6 +54,41 @@ impl IoError {
     }
 }
 
+/// Whether the system failed below an error: a full disk, a lost connection. Not where another path, or another file there,
+/// would help.
+pub fn system_failed(error: &(dyn Error + 'static)) -> bool {
+    let mut next = Some(error);
+    while let Some(e) = next {
+        let io = match e.downcast_ref::<image::ImageError>() {
+            Some(image::ImageError::IoError(io)) => Some(io),
+            _ => e.downcast_ref(),
+        };
+        if io.is_some_and(|io: &io::Error| !is_about_input(io.kind())) {
+            return true;
+        }
+        next = e.source();
+    }
+    false
+}
+
+fn is_about_input(kind: io::ErrorKind) -> bool {
+    use io::ErrorKind as K;
+    matches!(
+        kind,
+        K::NotFound
+            | K::PermissionDenied
+            | K::AlreadyExists
+            | K::IsADirectory
+            | K::NotADirectory
+            | K::DirectoryNotEmpty
+            | K::ReadOnlyFilesystem
+            | K::InvalidFilename
+            | K::InvalidInput
+            | K::InvalidData
+            | K::UnexpectedEof
+    )
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -67,5 +103,13 @@ mod tests {
         let error = std::fs::read(path).map_err(IoError::at(path)).unwrap_err();
         assert!(error.to_string().starts_with("none/there: "), "{error}");
         assert_eq!(error.source.kind(), io::ErrorKind::NotFound);
+    }
+
+    #[test]
+    fn a_full_disk_is_nobodys_input() {
+        let of = |kind: io::ErrorKind| IoError::at(Path::new("a"))(kind.into());
+        assert!(!system_failed(&of(io::ErrorKind::NotFound)) && system_failed(&of(io::ErrorKind::StorageFull)));
+        assert!(system_failed(&image::ImageError::IoError(io::ErrorKind::StorageFull.into())));
+        assert!(!system_failed(&Invalid::new("a", "b", "c")));
     }
 }

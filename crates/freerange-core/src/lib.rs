@@ -11,7 +11,7 @@ mod share;
 mod side_by_side;
 
 pub use background::Background;
-pub use error::{Invalid, IoError, check};
+pub use error::{Invalid, IoError, check, system_failed};
 pub use file::{beside, persist, sync_folder, sync_tree, write_atomically};
 pub use hash::{hex, sha256, sha256_of};
 pub use note::{Note, NoteKind};

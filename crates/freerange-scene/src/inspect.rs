@@ -131,14 +131,21 @@ fn view_reports(loaded: &Loaded, frame: &CanonicalFrame, shown: &[usize]) -> Vec
         .collect()
 }
 
-/// Looks at a scene. `frame`: where the object was found; `shown`: which views the model is shown.
-pub fn inspect(cameras: &Cameras, loaded: &Loaded, frame: &CanonicalFrame, shown: &[usize]) -> Inspection {
+/// Looks at a scene, of whose reading `notes` tell. `frame`: where the object was found; `shown`: which views the model is
+/// shown.
+pub fn inspect(
+    cameras: &Cameras,
+    loaded: &Loaded,
+    notes: &[Note],
+    frame: &CanonicalFrame,
+    shown: &[usize],
+) -> Inspection {
     let (centre, radius, up) = place(frame);
     let views = view_reports(loaded, frame, shown);
     let sureness = loaded.estimate.as_ref().map(estimate::Estimate::sureness);
     let found = frame.notes.iter().map(Note::understood);
     let (told, notes): (Vec<Note>, Vec<Note>) =
-        cameras.notes.iter().chain(&loaded.notes).cloned().chain(found).partition(|n| n.kind == NoteKind::Warning);
+        notes.iter().cloned().chain(found).partition(|n| n.kind == NoteKind::Warning);
     let warnings = told.into_iter().map(|n| n.text).chain(warnings(&views, sureness)).collect();
     Inspection {
         format: cameras.format,

@@ -1,7 +1,7 @@
 //! Photos in: the cameras of other programs, lenses, masks of the object, and what was understood of it all.
 //!
-//! [`read::cameras`] finds out what a folder is and reads the cameras; [`load`] makes views of the photos, undistorted and
-//! cut out.
+//! [`read::cameras_with`] finds out what a folder is and reads the cameras; [`Scene::load`] makes views of the photos,
+//! undistorted and cut out, and says which way is up.
 
 #![deny(missing_docs)]
 
@@ -11,10 +11,12 @@ pub mod inspect;
 mod load;
 #[cfg(feature = "mask-model")]
 mod network;
+mod open;
 pub mod read;
 mod write;
 
 pub use error::SceneError;
 pub use freerange_core::{Note, NoteKind};
 pub use load::{LoadConfig, Loaded, MaskKind, MaskModel, MaskSource, PixelRange, cut, files, load, up_of, write_masks};
+pub use open::{Scene, SceneConfig, views_to_compare};
 pub use write::write_colmap;

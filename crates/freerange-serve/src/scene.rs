@@ -9,12 +9,10 @@ use std::{
 use freerange_camera::{CameraError, FrameConfig, Similarity, Up, View, canonical_from_user};
 use freerange_core::write_atomically;
 use freerange_scene::{
-    LoadConfig, Loaded, MaskSource, SceneError,
+    LoadConfig, MaskSource, SceneConfig, SceneError,
     estimate::Hints,
     inspect::{inspect, sheet},
-    load,
-    read::{Cameras, Turntable, cameras},
-    up_of,
+    read::{ReadConfig, Turntable, cameras_with},
 };
 use image::{GrayImage, ImageFormat, ImageReader, Luma, Rgba, RgbaImage};
 use serde::{Deserialize, Serialize};
@@ -133,32 +131,26 @@ pub fn prepare(
 ) -> Result<Value, Refusal> {
     let refused = |e: SceneError| sentence(upload, &e);
     let root = root(upload).map_err(Refusal::own)?;
-    let found: Cameras = cameras(&root, None, options.turntable()?.as_ref()).map_err(refused)?;
+    let cameras = ReadConfig { turntable: options.turntable()?, ..ReadConfig::default() };
+    let found = cameras_with(&root, &cameras).map_err(refused)?;
     all_inside(
         upload,
         found.photos.iter().flat_map(|p| [Some(&p.image), p.mask.as_ref()]).flatten().chain(&found.files),
     )?;
-    let config = LoadConfig {
+    let photos = LoadConfig {
         masks: options.masks()?,
         invert_masks: options.invert_masks,
         max_side: limits.side,
         hints: Hints { others: engine.others_show(), ..Hints::default() },
     };
-    let mut loaded: Loaded = load(&found, &config).map_err(refused)?;
+    let config = SceneConfig { cameras, photos, up: options.up()? };
+    let freerange_scene::Scene { cameras, mut loaded, frame, notes } =
+        freerange_scene::Scene::load(found, &config).map_err(refused)?;
     // What is only compared with has no use here.
     loaded.further.clear();
-    let mut frame = FrameConfig::default();
-    match options.up()? {
-        Some(up) => frame.up = up,
-        None => {
-            let (up, note) = up_of(&found, &loaded);
-            frame.up = up;
-            loaded.notes.extend(note);
-        }
-    }
     let canonical = canonical_from_user(&loaded.views, &frame).map_err(|e: CameraError| sentence(upload, &e))?;
     let shown = engine.choose(&loaded.views).map_err(|e| Refusal::new(422, e))?;
-    let mut report = inspect(&found, &loaded, &canonical, &shown);
+    let mut report = inspect(&cameras, &loaded, &notes, &canonical, &shown);
     report.files.clear();
     save(&sheet(&loaded, &report), &sheet_file(folder))?;
     let mut kept = Kept { views: Vec::new(), frame };

@@ -5,25 +5,31 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use burn::tensor::Device;
 use freerange_core::{IoError, sha256};
 use freerange_flow::trainer::EncoderWeights;
 use freerange_model::{Checkpoint, Dinov2, EncoderConfig, Header};
 
-use crate::{Error, machine::weights_folder};
+use crate::{Device, Error, error::Lift, machine::weights_folder};
 
-static SHIPPED: &[u8] = include_bytes!("../../../checkpoints/tiny.safetensors");
+#[cfg(feature = "embedded")]
+const SHIPPED: Option<&[u8]> = Some(include_bytes!("../../../checkpoints/tiny.safetensors"));
+#[cfg(not(feature = "embedded"))]
+const SHIPPED: Option<&[u8]> = None;
 
 /// The files of a checkpoint, or of the shipped one where there is no path; and what messages call it.
 fn read(path: Option<&Path>) -> Result<(Cow<'static, [u8]>, &Path), Error> {
     Ok(match path {
-        None => (SHIPPED.into(), Path::new("the shipped checkpoint")),
+        None => {
+            let found = "none: this program was built without the shipped one (feature `embedded`), checkpoints/tiny.safetensors";
+            let shipped = SHIPPED.ok_or_else(|| Error::input("--checkpoint", "a checkpoint file", found))?;
+            (shipped.into(), Path::new("the shipped checkpoint"))
+        }
         Some(path) => {
             // A folder or a device has no size to read up to.
-            if !std::fs::metadata(path).map_err(IoError::at(path))?.is_file() {
+            if !std::fs::metadata(path).map_err(IoError::at(path)).lift()?.is_file() {
                 return Err(Error::input(path.display().to_string(), "a checkpoint file", "a folder or a device"));
             }
-            (std::fs::read(path).map_err(IoError::at(path))?.into(), path)
+            (std::fs::read(path).map_err(IoError::at(path)).lift()?.into(), path)
         }
     })
 }
@@ -51,7 +57,7 @@ pub fn checkpoint_sha256(path: Option<&Path>) -> Result<String, Error> {
 /// Names the file and what is wrong with it.
 pub fn checkpoint_header(path: Option<&Path>) -> Result<Header, Error> {
     let (bytes, name) = read(path)?;
-    Ok(Checkpoint::header(&bytes, name)?)
+    Checkpoint::header(&bytes, name).lift()
 }
 
 /// Reads this checkpoint, or the shipped one, with its encoder's weights if those are published ones.
@@ -60,11 +66,11 @@ pub fn checkpoint_header(path: Option<&Path>) -> Result<Header, Error> {
 /// Names the file and what is wrong with it; where the encoder's weights were looked for, or that others were found.
 pub fn load_checkpoint(path: Option<&Path>, encoders: &EncoderPlaces, device: &Device) -> Result<Checkpoint, Error> {
     let (bytes, name) = read(path)?;
-    let header = Checkpoint::header(&bytes, name)?;
+    let header = Checkpoint::header(&bytes, name).lift()?;
     let encoder = match (&header.config.encoder, &header.encoder_weights) {
         (EncoderConfig::Dinov2(_), Some(origin)) => {
-            let weights = encoders.find(&origin.name)?;
-            let encoder = Dinov2::load_as(&weights.folder, &origin.name, device)?;
+            let weights = find_encoder(encoders, &origin.name)?;
+            let encoder = Dinov2::load_as(&weights.folder, &origin.name, &device.0).lift()?;
             let found = encoder.origin().map_or("", |o| o.sha256.as_str());
             if found != origin.sha256 {
                 let expected = format!(
@@ -84,7 +90,7 @@ pub fn load_checkpoint(path: Option<&Path>, encoders: &EncoderPlaces, device: &D
         }
         (EncoderConfig::Patch(_), _) => None,
     };
-    Ok(Checkpoint::from_bytes(&bytes, name, encoder, device)?)
+    Checkpoint::from_bytes(&bytes, name, encoder, &device.0).lift()
 }
 
 /// Where the published weights of frozen encoders are looked for.
@@ -111,55 +117,58 @@ impl EncoderPlaces {
     pub fn at(folder: Option<PathBuf>) -> Self {
         Self { folder, ..Self::default() }
     }
+}
 
-    /// Finds the weights of this name: a folder, or `hf:owner/name` for the hub's, of which nothing is downloaded.
-    ///
-    /// # Errors
-    /// Says where they were looked for.
-    pub fn find(&self, name: &str) -> Result<EncoderWeights, Error> {
-        let places = match (&self.folder, hub_name(name)?) {
-            (Some(folder), _) => vec![folder.clone()],
-            (None, None) => vec![PathBuf::from(name)],
-            (None, Some((_, repository))) => self.cache.iter().map(|cache| cache.join(repository)).collect(),
-        };
-        let missing = |folder: &PathBuf| FILES.into_iter().find(|file| !folder.join(file).is_file());
-        if let Some(folder) = places.iter().find(|folder| missing(folder).is_none()) {
-            return Ok(EncoderWeights { name: name.into(), folder: folder.clone() });
-        }
-        let looked: Vec<String> = places
-            .iter()
-            .map(|folder| format!("{} (no {})", folder.display(), missing(folder).unwrap_or_default()))
-            .collect();
-        let hint = match hub_name(name)? {
-            Some((_, repository)) => {
-                format!("; `freerange weights fetch {repository}` downloads the known ones, or name")
-            }
-            None => "; name".into(),
-        };
-        Err(Error::input(
-            format!("encoder weights `{name}`"),
-            format!("a folder with {}{hint} their folder (--encoder-weights)", FILES.join(" and ")),
-            if looked.is_empty() { "no cache folder on this system".into() } else { looked.join(", ") },
-        ))
+/// Finds the weights of this name: a folder, or `hf:owner/name` for the hub's, of which nothing is downloaded.
+///
+/// # Errors
+/// Says where they were looked for.
+pub fn find_encoder(encoders: &EncoderPlaces, name: &str) -> Result<EncoderWeights, Error> {
+    let places = match (&encoders.folder, hub_name(name)?) {
+        (Some(folder), _) => vec![folder.clone()],
+        (None, None) => vec![PathBuf::from(name)],
+        (None, Some((_, repository))) => encoders.cache.iter().map(|cache| cache.join(repository)).collect(),
+    };
+    let missing = |folder: &PathBuf| FILES.into_iter().find(|file| !folder.join(file).is_file());
+    if let Some(folder) = places.iter().find(|folder| missing(folder).is_none()) {
+        return Ok(EncoderWeights { name: name.into(), folder: folder.clone() });
     }
-
-    /// The weights that training with this encoder needs: those it names, or those that the user names. None for an encoder
-    /// of the model's own, for random ones, and where nobody names any.
-    ///
-    /// # Errors
-    /// As [`find`](Self::find).
-    pub fn for_training(&self, encoder: &EncoderConfig) -> Result<Option<EncoderWeights>, Error> {
-        let named = match encoder {
-            EncoderConfig::Dinov2(c) => c.weights.clone(),
-            EncoderConfig::Patch(_) => None,
-        };
-        match (named, &self.folder) {
-            (Some(name), _) if name.starts_with("hf:") => self.find(&name).map(Some),
-            // A checkpoint is read from any working directory.
-            (_, Some(folder)) => self.find(&absolute(folder)).map(Some),
-            (Some(name), None) => self.find(&absolute(Path::new(&name))).map(Some),
-            (None, None) => Ok(None),
+    let looked: Vec<String> = places
+        .iter()
+        .map(|folder| format!("{} (no {})", folder.display(), missing(folder).unwrap_or_default()))
+        .collect();
+    let hint = match hub_name(name)? {
+        Some((_, repository)) => {
+            format!("; `freerange weights fetch {repository}` downloads the known ones, or name")
         }
+        None => "; name".into(),
+    };
+    Err(Error::input(
+        format!("encoder weights `{name}`"),
+        format!("a folder with {}{hint} their folder (--encoder-weights)", FILES.join(" and ")),
+        if looked.is_empty() { "no cache folder on this system".into() } else { looked.join(", ") },
+    ))
+}
+
+/// The weights that training with this encoder needs: those it names, or those that the user names. None for an encoder
+/// of the model's own, for random ones, and where nobody names any.
+///
+/// # Errors
+/// As [`find_encoder`].
+pub fn encoder_for_training(
+    encoders: &EncoderPlaces,
+    encoder: &EncoderConfig,
+) -> Result<Option<EncoderWeights>, Error> {
+    let named = match encoder {
+        EncoderConfig::Dinov2(c) => c.weights.clone(),
+        EncoderConfig::Patch(_) => None,
+    };
+    match (named, &encoders.folder) {
+        (Some(name), _) if name.starts_with("hf:") => find_encoder(encoders, &name).map(Some),
+        // A checkpoint is read from any working directory.
+        (_, Some(folder)) => find_encoder(encoders, &absolute(folder)).map(Some),
+        (Some(name), None) => find_encoder(encoders, &absolute(Path::new(&name))).map(Some),
+        (None, None) => Ok(None),
     }
 }
 
@@ -197,12 +206,12 @@ mod tests {
     #[test]
     fn what_is_not_there_is_told_with_all_places() {
         let places = EncoderPlaces { folder: None, cache: Some("no/cache".into()) };
-        let error = places.find("hf:facebook/dinov2-base").unwrap_err().to_string();
+        let error = find_encoder(&places, "hf:facebook/dinov2-base").unwrap_err().to_string();
         assert!(error.contains("no/cache/dinov2-base") && error.contains("weights fetch dinov2-base"), "{error}");
         let places = EncoderPlaces { folder: Some("my/own".into()), ..places };
-        let error = places.find("hf:facebook/dinov2-base").unwrap_err().to_string();
+        let error = find_encoder(&places, "hf:facebook/dinov2-base").unwrap_err().to_string();
         assert!(error.contains("my/own (no config.json)") && !error.contains("no/cache"), "{error}");
-        let error = EncoderPlaces { folder: None, cache: None }.find("hf:a/b").unwrap_err().to_string();
+        let error = find_encoder(&EncoderPlaces { folder: None, cache: None }, "hf:a/b").unwrap_err().to_string();
         assert!(error.contains("no cache folder"), "{error}");
     }
 }

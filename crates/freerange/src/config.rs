@@ -10,10 +10,13 @@ use freerange_model::{Checkpoint, Compute};
 use freerange_splat::Cloud;
 use serde::{Deserialize, Serialize};
 
-use crate::Error;
+use crate::{
+    Error,
+    error::{Beneath, Lift},
+};
 
 /// Settings of the five steps of the [pipeline](crate::pipeline). Records hold every field, with
-/// [`SETTINGS_SCHEMA`](crate::SETTINGS_SCHEMA). [`PipelineConfig::preset`] makes one for a model.
+/// [`SETTINGS_SCHEMA`](crate::SETTINGS_SCHEMA). [`Reconstructor::options`](crate::Reconstructor::options) makes one for a model.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PipelineConfig {
@@ -128,8 +131,8 @@ impl PipelineConfig {
     ///
     /// # Errors
     /// If what the checkpoint says of its use cannot be read.
-    pub fn preset(checkpoint: &Checkpoint, quality: Quality) -> Result<Self, Error> {
-        let Settings { network_views, sample, refiner } = Settings::of(&checkpoint.provenance)?;
+    pub(crate) fn preset(checkpoint: &Checkpoint, quality: Quality) -> Result<Self, Error> {
+        let Settings { network_views, sample, refiner } = Settings::of(&checkpoint.provenance).lift()?;
         let depth = refiner.as_ref().and_then(|r| r.lod_depth).unwrap_or(checkpoint.depth);
         let fit = QuickFitConfig { gaussians: 1 << depth.min(16), ..QuickFitConfig::default() };
         let whole = refiner.is_some();
@@ -188,9 +191,9 @@ impl PipelineConfig {
         check((1..=64).contains(&count), "propose.count", "1 to 64", count.to_string())?;
         let alone = count == 1 || optimize.iterations > 0;
         check(alone, "propose.count", "1 without optimization, which alone uses the others", count.to_string())?;
-        propose.fit.check()?;
-        propose.flow.validate().map_err(|e| e.within("propose.flow"))?;
-        refine.as_ref().map_or(Ok(()), RefinerConfig::validate).map_err(|e| e.within("refine"))?;
+        propose.fit.check().lift()?;
+        propose.flow.validate().map_err(|e| e.within("propose.flow").lift())?;
+        refine.as_ref().map_or(Ok(()), RefinerConfig::validate).map_err(|e| e.within("refine").lift())?;
         let (iterations, size) = (optimize.iterations, optimize.max_resolution);
         check(iterations <= 100_000, "optimize.iterations", "0 to 100000", iterations.to_string())?;
         let allowed = size.is_multiple_of(UNIT) && (UNIT..=MOST_RESOLUTION).contains(&size);
@@ -224,7 +227,7 @@ impl Choices {
     ///
     /// # Errors
     /// Names the choice that cannot be followed.
-    pub fn pipeline(&self, checkpoint: &Checkpoint) -> Result<PipelineConfig, Error> {
+    pub(crate) fn pipeline(&self, checkpoint: &Checkpoint) -> Result<PipelineConfig, Error> {
         let mut pipeline = PipelineConfig::preset(checkpoint, self.quality)?;
         if self.quality != Quality::Default && pipeline.refine.is_none() {
             let expected = "default: a model that only samples has no presets";
@@ -278,6 +281,5 @@ pub struct Options {
     /// Which way is up in the views' frame, and where the object is, if that is known.
     pub frame: FrameConfig,
     /// Leave the network out: the control of comparisons.
-    #[doc(hidden)]
-    pub without_network: bool,
+    pub(crate) without_network: bool,
 }

@@ -6,15 +6,81 @@ use std::{
     str::FromStr,
 };
 
-use burn::tensor::Device;
+use burn::tensor::Device as TensorDevice;
 use freerange_model::Compute;
 use serde::Serialize;
 
 use crate::Error;
 
+/// A device that is ready to compute. Prints as reports say it: `cpu`, or `cuda:0` with the maker's name.
+///
+/// ```
+/// use freerange::Device;
+/// let device = Device::open("auto")?; // the first GPU that can be used, else the CPU
+/// println!("{device}, of {} devices", Device::list().len());
+/// # Ok::<(), freerange::Error>(())
+/// ```
+#[derive(Clone, Debug, PartialEq)]
+pub struct Device(pub(crate) TensorDevice);
+
+impl Device {
+    /// All cores, SIMD; needs nothing installed.
+    pub fn cpu() -> Self {
+        Self(TensorDevice::flex())
+    }
+
+    /// The device of this name: `auto`, `cpu`, `cuda`, `cuda:1`, `vulkan:0` ... See [`DeviceName::open`].
+    ///
+    /// # Errors
+    /// [`Error::NoDevice`] if this program was built without it, or there is none; [`Error::DeviceFailed`] if it cannot be
+    /// opened.
+    pub fn open(name: &str) -> Result<Self, Error> {
+        let parsed: DeviceName = name.parse().map_err(|e| Error::NoDevice(format!("device `{name}`: {e}")))?;
+        parsed.open()
+    }
+
+    /// Every device that this program can use, the best first; the CPU last. Opens all of them.
+    pub fn list() -> Vec<DeviceInfo> {
+        let of = |api: GpuApi| {
+            let gpu = move |(index, device): (usize, TensorDevice)| DeviceInfo::gpu(api, index, &device);
+            api.devices().into_iter().enumerate().map(gpu)
+        };
+        GpuApi::ALL.into_iter().flat_map(of).chain([DeviceInfo::cpu()]).collect()
+    }
+
+    /// Its name, and what it can do. No other one is opened.
+    pub fn info(&self) -> DeviceInfo {
+        let gpu = |api: GpuApi| {
+            let index = api.devices().iter().position(|found| *found == self.0)?;
+            Some(DeviceInfo::gpu(api, index, &self.0))
+        };
+        GpuApi::ALL.into_iter().find_map(gpu).unwrap_or_else(DeviceInfo::cpu)
+    }
+
+    /// Refuses arithmetic that it does not have.
+    ///
+    /// # Errors
+    /// [`Error::NoDevice`]
+    pub fn require(&self, precision: Compute) -> Result<(), Error> {
+        match precision.supported(&self.0) {
+            true => Ok(()),
+            false => Err(Error::NoDevice(format!(
+                "{} cannot compute in {precision:?}: choose another precision (see `freerange devices`)",
+                self.info().name
+            ))),
+        }
+    }
+}
+
+impl fmt::Display for Device {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.info().fmt(f)
+    }
+}
+
 /// How a GPU is reached.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Api {
+pub enum GpuApi {
     /// NVIDIA's own; the fastest on its cards.
     Cuda,
     /// Metal's shading language, on Apple's GPUs.
@@ -25,7 +91,7 @@ pub enum Api {
     WebGpu,
 }
 
-impl Api {
+impl GpuApi {
     /// From the most to the least specialised.
     pub const ALL: [Self; 4] = [Self::Cuda, Self::Metal, Self::Vulkan, Self::WebGpu];
 
@@ -50,18 +116,18 @@ impl Api {
     }
 
     /// The devices found, in the system's order; none where the driver is missing.
-    pub fn devices(self) -> Vec<Device> {
+    fn devices(self) -> Vec<TensorDevice> {
         #[cfg(feature = "gpu")]
         use burn::tensor::DeviceType;
-        let found: Vec<Device> = match self {
+        let found: Vec<TensorDevice> = match self {
             #[cfg(feature = "cuda")]
-            Self::Cuda => Device::enumerate(DeviceType::Cuda).into_iter().collect(),
+            Self::Cuda => TensorDevice::enumerate(DeviceType::Cuda).into_iter().collect(),
             #[cfg(feature = "metal")]
-            Self::Metal => Device::enumerate(DeviceType::Metal).into_iter().collect(),
+            Self::Metal => TensorDevice::enumerate(DeviceType::Metal).into_iter().collect(),
             #[cfg(feature = "vulkan")]
-            Self::Vulkan => Device::enumerate(DeviceType::Vulkan).into_iter().collect(),
+            Self::Vulkan => TensorDevice::enumerate(DeviceType::Vulkan).into_iter().collect(),
             #[cfg(feature = "webgpu")]
-            Self::WebGpu => Device::enumerate(DeviceType::Wgpu).into_iter().collect(),
+            Self::WebGpu => TensorDevice::enumerate(DeviceType::Wgpu).into_iter().collect(),
             #[allow(unreachable_patterns)] // reachable in builds with fewer features
             _ => Vec::new(),
         };
@@ -77,7 +143,7 @@ pub enum DeviceName {
     /// All cores, SIMD; needs nothing installed.
     Cpu,
     /// The GPU of this number.
-    Gpu(Api, usize),
+    Gpu(GpuApi, usize),
 }
 
 impl FromStr for DeviceName {
@@ -95,7 +161,7 @@ impl FromStr for DeviceName {
             ("auto", None) => Ok(Self::Auto),
             ("cpu", None) => Ok(Self::Cpu),
             ("auto" | "cpu", Some(_)) => Err(format!("`{name}` takes no number")),
-            _ => match Api::ALL.into_iter().find(|api| api.name() == name) {
+            _ => match GpuApi::ALL.into_iter().find(|api| api.name() == name) {
                 Some(api) => Ok(Self::Gpu(api, index.unwrap_or(0))),
                 None => Err("expected auto, cpu, cuda, metal, vulkan or webgpu, as in `cuda` or `cuda:1`".into()),
             },
@@ -114,15 +180,15 @@ impl fmt::Display for DeviceName {
 }
 
 impl DeviceName {
-    /// The device, without differentiation, and ready to use. See [`open_telling`](Self::open_telling).
+    /// The device, ready to compute; of [`Auto`](Self::Auto) the first GPU that can be used, else the CPU.
     ///
     /// # Errors
-    /// As there.
+    /// If this program was built without it, or no such device is found or can be opened.
     pub fn open(self) -> Result<Device, Error> {
         self.open_telling(0, &mut |_| {})
     }
 
-    /// The device, without differentiation, and ready to use. [`Auto`](Self::Auto) is the GPU of this `number` among those
+    /// The device, ready to compute. [`Auto`](Self::Auto) is the GPU of this `number` among those
     /// of its kind, from the first on again where there are fewer, or the next one that can be used; without any, the CPU.
     /// `tell` hears of GPUs that are there and cannot be opened. No other one is opened: each would give memory to it.
     ///
@@ -130,10 +196,10 @@ impl DeviceName {
     /// If this program was built without it, or no such device is found or can be opened.
     pub fn open_telling(self, number: usize, tell: &mut dyn FnMut(&str)) -> Result<Device, Error> {
         match self {
-            Self::Cpu => Ok(Device::flex()),
+            Self::Cpu => Ok(Device::cpu()),
             Self::Auto => {
-                let found = Api::ALL.map(|api| (api, api.devices()));
-                Ok(first_gpu(found, number, properties, tell).unwrap_or_else(Device::flex))
+                let found = GpuApi::ALL.map(|api| (api, api.devices()));
+                Ok(first_gpu(found, number, properties, tell).map_or_else(Device::cpu, Device))
             }
             Self::Gpu(api, _) if !api.compiled() => Err(Error::NoDevice(format!(
                 "device {self}: this program was built without it; build it with `cargo build --release --features {}`",
@@ -149,8 +215,8 @@ impl DeviceName {
                     })
                 })?;
                 match properties(&device) {
-                    Ok(_) => Ok(device),
-                    Err(problem) => Err(Error::BrokenDevice(format!("device {self} could not be opened: {problem}"))),
+                    Ok(_) => Ok(Device(device)),
+                    Err(problem) => Err(Error::DeviceFailed(format!("device {self} could not be opened: {problem}"))),
                 }
             }
         }
@@ -160,9 +226,9 @@ impl DeviceName {
 /// The first device, from `number` on, that opens and is real hardware: a software rasteriser pretends to be a GPU, and is
 /// slower than the CPU used directly.
 fn first_gpu<T>(
-    found: impl IntoIterator<Item = (Api, Vec<T>)>,
+    found: impl IntoIterator<Item = (GpuApi, Vec<T>)>,
     number: usize,
-    open: impl Fn(&T) -> Result<(Properties, bool), String>,
+    open: impl Fn(&T) -> Result<(DeviceProperties, bool), String>,
     tell: &mut dyn FnMut(&str),
 ) -> Option<T> {
     let mut broken = false;
@@ -185,23 +251,9 @@ fn first_gpu<T>(
     None
 }
 
-/// Refuses arithmetic that a device does not have.
-///
-/// # Errors
-/// Names the device.
-pub fn require(compute: Compute, device: &Device) -> Result<(), Error> {
-    match compute.supported(device) {
-        true => Ok(()),
-        false => Err(Error::NoDevice(format!(
-            "{} cannot compute in {compute:?}: choose another `compute` (see `freerange devices`)",
-            Listed::of(device).name
-        ))),
-    }
-}
-
 /// What a device can do.
 #[derive(Clone, Debug, Default, Serialize)]
-pub struct Properties {
+pub struct DeviceProperties {
     /// As the maker calls it.
     pub hardware: String,
     /// Bytes of memory; none where the driver does not tell.
@@ -220,48 +272,40 @@ pub struct Properties {
     pub float_atomics: bool,
 }
 
-/// A device that this program can use, or why it cannot.
+/// What a device can do, or why it cannot be used.
 #[derive(Clone, Debug, Serialize)]
-pub struct Listed {
+pub struct DeviceInfo {
     /// As [`DeviceName`] writes it.
     pub name: String,
     /// Whether it is real hardware, not a processor that plays one.
     pub gpu: bool,
     /// What it can do, if it could be opened.
-    pub properties: Properties,
+    pub properties: DeviceProperties,
     /// Why it cannot be used.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub problem: Option<String>,
 }
 
-impl Listed {
-    /// What is known of an opened device. No other one is opened.
-    pub fn of(device: &Device) -> Self {
-        let gpu = |api: Api| {
-            let index = api.devices().iter().position(|found| found == device)?;
-            Some(Self::gpu(api, index, device))
-        };
-        Api::ALL.into_iter().find_map(gpu).unwrap_or_else(Self::cpu)
-    }
-
-    fn gpu(api: Api, index: usize, device: &Device) -> Self {
+impl DeviceInfo {
+    fn gpu(api: GpuApi, index: usize, device: &TensorDevice) -> Self {
         let name = DeviceName::Gpu(api, index).to_string();
         match properties(device) {
             Ok((properties, gpu)) => Self { name, gpu, properties, problem: None },
-            Err(problem) => Self { name, gpu: false, properties: Properties::default(), problem: Some(problem) },
+            Err(problem) => Self { name, gpu: false, properties: DeviceProperties::default(), problem: Some(problem) },
         }
     }
 
     fn cpu() -> Self {
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let hardware = format!("{}, {cores} threads", crate::machine::processor());
-        let properties = Properties { hardware, memory_bytes: crate::machine::memory(), ..Properties::default() };
+        let properties =
+            DeviceProperties { hardware, memory_bytes: crate::machine::memory(), ..DeviceProperties::default() };
         Self { name: "cpu".into(), gpu: false, properties, problem: None }
     }
 }
 
 /// As reports say it: `cpu`, or the name of a GPU with its maker's.
-impl fmt::Display for Listed {
+impl fmt::Display for DeviceInfo {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.gpu {
             true => write!(f, "{} ({})", self.name, self.properties.hardware),
@@ -270,17 +314,8 @@ impl fmt::Display for Listed {
     }
 }
 
-/// Every device that this program can use, the best first; the CPU last. Opens all of them.
-pub fn devices() -> Vec<Listed> {
-    let of = |api: Api| {
-        let gpu = move |(index, device): (usize, Device)| Listed::gpu(api, index, &device);
-        api.devices().into_iter().enumerate().map(gpu)
-    };
-    Api::ALL.into_iter().flat_map(of).chain([Listed::cpu()]).collect()
-}
-
-/// Properties, and whether the device is real hardware. Opens it.
-fn properties(device: &Device) -> Result<(Properties, bool), String> {
+/// DeviceProperties, and whether the device is real hardware. Opens it.
+fn properties(device: &TensorDevice) -> Result<(DeviceProperties, bool), String> {
     // The driver's bindings panic where it turns out to be broken.
     catch_unwind(AssertUnwindSafe(|| ask(device))).map_err(|cause| {
         let text = cause.downcast_ref::<String>().cloned();
@@ -289,16 +324,16 @@ fn properties(device: &Device) -> Result<(Properties, bool), String> {
 }
 
 #[cfg(not(feature = "gpu"))]
-fn ask(_: &Device) -> (Properties, bool) {
-    (Properties::default(), false)
+fn ask(_: &TensorDevice) -> (DeviceProperties, bool) {
+    (DeviceProperties::default(), false)
 }
 
 #[cfg(feature = "gpu")]
-fn ask(device: &Device) -> (Properties, bool) {
+fn ask(device: &TensorDevice) -> (DeviceProperties, bool) {
     use burn::backend::DispatchDevice;
     use burn::tensor::FloatDType;
     use cubecl::ir::{ElemType, FloatKind, Type, features::AtomicUsage};
-    let DispatchDevice::Cube(cube) = device.as_dispatch() else { return (Properties::default(), false) };
+    let DispatchDevice::Cube(cube) = device.as_dispatch() else { return (DeviceProperties::default(), false) };
     let client = cube.client();
     let p = client.properties();
     let f32_atomic = Type::atomic(Type::Scalar(ElemType::Float(FloatKind::F32)));
@@ -306,7 +341,7 @@ fn ask(device: &Device) -> (Properties, bool) {
         p.features.matmul.cmma.iter().map(|m| format!("{:?}", m.a_type).to_lowercase()).collect();
     matrix_units.sort();
     matrix_units.dedup();
-    let properties = Properties {
+    let properties = DeviceProperties {
         hardware: p.identity.name.clone(),
         memory_bytes: p.memory.max_memory(),
         plane: (!p.features.plane.is_empty()).then_some(p.hardware.plane_size_max),
@@ -328,7 +363,7 @@ mod tests {
         for text in ["auto", "cpu", "cuda:0", "metal:3", "vulkan:1", "webgpu:12"] {
             assert_eq!(text.parse::<DeviceName>().unwrap().to_string(), text);
         }
-        assert_eq!("cuda".parse(), Ok(DeviceName::Gpu(Api::Cuda, 0)));
+        assert_eq!("cuda".parse(), Ok(DeviceName::Gpu(GpuApi::Cuda, 0)));
         for bad in ["", "gpu", "CPU", "cpu:0", "auto:1", "cuda:", "cuda:-1", "cuda:x", "cuda:0:1"] {
             assert!(bad.parse::<DeviceName>().is_err(), "{bad}");
         }
@@ -344,10 +379,10 @@ mod tests {
                 match state.to_ascii_lowercase() {
                     'x' => Err("driver".to_owned()),
                     // A letter of hardware, or `-` for a processor that plays it.
-                    state => Ok((Properties::default(), state != '-')),
+                    state => Ok((DeviceProperties::default(), state != '-')),
                 }
             };
-            let found = [Api::Cuda, Api::Vulkan].into_iter().zip(states.map(<[char]>::to_vec));
+            let found = [GpuApi::Cuda, GpuApi::Vulkan].into_iter().zip(states.map(<[char]>::to_vec));
             let chosen = first_gpu(found, number, open, &mut |note| told.push(note.to_owned()));
             (chosen, opened.into_inner(), told)
         };
@@ -361,15 +396,15 @@ mod tests {
         let (chosen, _, told) = choose(0, [&['x'], &['-', 'x']]);
         assert_eq!((chosen, told.len()), (None, 3));
         assert!(told[1].contains("vulkan:1") && told[2].contains("the CPU computes"), "{told:?}");
-        let cpu = Listed::of(&Device::flex());
+        let cpu = Device::cpu().info();
         assert_eq!((cpu.name.as_str(), cpu.to_string().as_str(), cpu.problem), ("cpu", "cpu", None));
     }
 
     #[test]
     fn the_cpu_is_always_there_and_what_is_not_built_in_is_named() {
-        assert_eq!(devices().last().map(|d| d.name.clone()), Some("cpu".into()));
+        assert_eq!(Device::list().last().map(|d| d.name.clone()), Some("cpu".into()));
         assert!(DeviceName::Auto.open().is_ok());
-        for api in Api::ALL.into_iter().filter(|api| !api.compiled()) {
+        for api in GpuApi::ALL.into_iter().filter(|api| !api.compiled()) {
             let error = DeviceName::Gpu(api, 0).open().unwrap_err();
             assert!(matches!(error, Error::NoDevice(_)));
             assert!(error.to_string().contains(&format!("--features {}", api.name())), "{error}");

@@ -9,7 +9,7 @@ use freerange_splat::Cloud;
 use image::{Rgba, RgbaImage};
 use rayon::prelude::*;
 
-use crate::{Error, to_canonical};
+use crate::{Error, error::Lift, to_canonical};
 
 /// Shows each view as a quick fit of all the others has it: straight colour and alpha, at its image's size, in the order of `views`, whose
 /// alpha is the object's mask. What one mask lacks by mistake others have, and the other way round. (`freerange_scene::estimate::OthersShow`.)
@@ -31,7 +31,7 @@ fn shown(views: &[View]) -> Result<Vec<RgbaImage>, Error> {
         .map(|i| {
             let others: Vec<View> =
                 framed.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, v)| v.clone()).collect();
-            let cloud = quick_fit(&others, &config, i as u64, |_| ControlFlow::Continue(()))?;
+            let cloud = quick_fit(&others, &config, i as u64, |_| ControlFlow::Continue(())).lift()?;
             picture(&cloud, &canonical[i].camera)
         })
         .collect()
@@ -39,7 +39,7 @@ fn shown(views: &[View]) -> Result<Vec<RgbaImage>, Error> {
 
 /// The cloud in straight colour and alpha.
 fn picture(cloud: &Cloud, camera: &Camera) -> Result<RgbaImage, Error> {
-    let shown = freerange_raster::render(cloud.rows(), &[*camera], &[[0.0; 3]], &RasterConfig::default())?;
+    let shown = freerange_raster::render(cloud.rows(), &[*camera], &[[0.0; 3]], &RasterConfig::default()).lift()?;
     let byte = |v: f32| (255.0 * v.clamp(0.0, 1.0)).round() as u8;
     let pixels = shown.rgb.as_chunks::<3>().0.iter().zip(&shown.alpha).map(|(rgb, &alpha)| {
         // Over black, colours are multiplied by alpha.

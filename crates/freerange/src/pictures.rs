@@ -12,7 +12,7 @@ use freerange_splat::{Cloud, RenderMode, Splats};
 use glam::{DMat4, DVec3};
 use image::{Delay, Frame, RgbaImage, codecs::gif};
 
-use crate::Error;
+use crate::{Error, error::Lift};
 
 /// The colour behind the object in everything that is measured or shown.
 pub const WHITE: [f32; 3] = [1.0; 3];
@@ -22,7 +22,7 @@ pub const WHITE: [f32; 3] = [1.0; 3];
 /// # Errors
 /// If the rasteriser refuses the camera or the cloud.
 pub fn render_view(cloud: &Cloud, camera: &Camera) -> Result<Vec<f32>, Error> {
-    Ok(render(cloud.rows(), &[*camera], &[WHITE], &in_units_of(cloud, camera))?.rgb)
+    Ok(render(cloud.rows(), &[*camera], &[WHITE], &in_units_of(cloud, camera)).lift()?.rgb)
 }
 
 /// Settings with a near plane for the cloud's own units: as usual from a distance of one unit on, in proportion below.
@@ -48,7 +48,7 @@ pub fn render_splats(splats: &Splats, camera: &Camera, mode: RenderMode) -> Resu
     }
     let rows = mip_compensated(cloud.rows(), &camera, MIP_BLUR);
     let config = RasterConfig { blur: MIP_BLUR, ..RasterConfig::default() };
-    Ok(render(&rows, &[camera], &[WHITE], &config)?.rgb)
+    Ok(render(&rows, &[camera], &[WHITE], &config).lift()?.rgb)
 }
 
 /// An image composited on white.
@@ -61,9 +61,9 @@ pub fn on_white(image: &RgbaImage) -> RgbaImage {
 /// # Errors
 /// If the file cannot be written, or the rasteriser refuses the cloud.
 pub fn write_turntable(path: &Path, cloud: &Cloud, frames: u32, size: u32) -> Result<(), Error> {
-    let file = std::fs::File::create(path).map_err(IoError::at(path))?;
+    let file = std::fs::File::create(path).map_err(IoError::at(path)).lift()?;
     let mut encoder = gif::GifEncoder::new_with_speed(std::io::BufWriter::new(file), 10);
-    let broken = |source: image::ImageError| Error::Picture { path: path.into(), source };
+    let broken = |source: image::ImageError| Error::picture(path, source);
     encoder.set_repeat(gif::Repeat::Infinite).map_err(broken)?;
     for i in 0..frames {
         let azimuth = std::f64::consts::TAU * f64::from(i) / f64::from(frames);

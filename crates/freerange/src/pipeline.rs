@@ -6,9 +6,10 @@
 //!    rotated silhouettes ([`SymmetryConfig`](crate::SymmetryConfig)).
 //! 3. Propose: some sets of Gaussians, by [initial fits](freerange_fit::quick_fit), by the paper's
 //!    [`FlowSampler`](freerange_flow::sample::FlowSampler), or from the user ([`ProposeConfig`](crate::ProposeConfig)).
-//! 4. Refine: the network corrects each proposal ([`Refiner`](freerange_flow::sample::Refiner)).
+//! 4. Refine: the network corrects each proposal ([`Refiner`](freerange_flow::sample::Refiner),
+//!    [`RefinerConfig`](crate::RefinerConfig)).
 //! 5. Optimize: photos decide where they look, the proposals' mean renders where none does
-//!    ([`freerange_fit::refine`]).
+//!    ([`freerange_fit::refine`], [`OptimizeConfig`](crate::OptimizeConfig)).
 //!
 //! The result goes back to the user's frame.
 
@@ -19,15 +20,16 @@ mod refine;
 mod symmetry;
 mod watch;
 
-use std::ops::ControlFlow;
+use std::{ops::ControlFlow, path::Path};
 
 pub(crate) use canonical::CanonicalScene;
 pub use canonical::{choose_views, to_canonical, to_user};
 use freerange_camera::{Similarity, View};
 use freerange_core::Note;
 use freerange_splat::Cloud;
+use glam::DVec3;
 
-use crate::{Error, Options, Progress, Reconstructor, Scene, Stage};
+use crate::{Error, Options, Progress, Reconstructor, Scene, Stage, write_gaussians};
 use watch::Watch;
 
 /// One sample.
@@ -58,6 +60,23 @@ pub struct Reconstruction {
     pub notes: Vec<Note>,
     /// Seconds per stage, in order; of several samples together.
     pub seconds: Vec<(Stage, f64)>,
+}
+
+impl Reconstruction {
+    /// Which way is up in the frame of the views.
+    pub fn up(&self) -> DVec3 {
+        // The canonical frame has +z up.
+        self.canonical_from_user.rotation.inverse() * DVec3::Z
+    }
+
+    /// Writes the first sample as [`write_gaussians`] does.
+    ///
+    /// # Errors
+    /// As there; if there is no sample.
+    pub fn write(&self, path: &Path) -> Result<Vec<Note>, Error> {
+        let sample = self.samples.first().ok_or_else(|| Error::input("seeds", "one or more", "none"))?;
+        write_gaussians(&sample.gaussians, path, self.up())
+    }
 }
 
 impl Reconstructor {

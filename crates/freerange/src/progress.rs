@@ -4,7 +4,7 @@ use freerange_camera::Similarity;
 use freerange_flow::sample::Estimate;
 use freerange_splat::Cloud;
 
-use crate::{Error, to_user};
+use crate::{Error, error::Lift, to_user};
 
 /// A step of the [pipeline](crate::pipeline), in the order in which they come.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, serde::Serialize)]
@@ -81,7 +81,7 @@ impl Progress<'_> {
         let Some((preview, place)) = self.preview else { return Ok(None) };
         let cloud = match preview {
             Preview::Fit(cloud) => Some(cloud.clone()),
-            Preview::Network(estimate) => estimate.clouds().map_err(Error::from)?.into_iter().next(),
+            Preview::Network(estimate) => estimate.clouds().lift()?.into_iter().next(),
             Preview::Read(clouds) => clouds.first().cloned(),
         };
         Ok(cloud.map(|cloud| to_user(&cloud, place)))

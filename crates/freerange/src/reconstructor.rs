@@ -2,12 +2,15 @@
 
 use std::path::Path;
 
-use burn::tensor::Device;
 use freerange_camera::FrameConfig;
 use freerange_flow::settings::Settings;
 use freerange_model::Checkpoint;
 
-use crate::{Choices, EncoderPlaces, Error, Init, Options, load_checkpoint, require};
+use crate::{
+    Choices, Device, EncoderPlaces, Error, Init, Options,
+    checkpoint::load_checkpoint,
+    error::{Beneath, Lift},
+};
 
 /// A model on a device, ready to reconstruct one object after the other. It can be shared between threads.
 #[derive(Clone, Debug)]
@@ -17,12 +20,13 @@ pub struct Reconstructor {
 }
 
 impl Reconstructor {
-    /// The model that is part of this program.
+    /// The model that is part of the library (feature `embedded`, 40 MB).
     ///
     /// # Errors
     /// If the device fails.
+    #[cfg(feature = "embedded")]
     pub fn shipped(device: &Device) -> Result<Self, Error> {
-        Ok(Self::new(load_checkpoint(None, &EncoderPlaces::default(), device)?, device))
+        crate::internal::shipped(device)
     }
 
     /// A model from a file. The weights of a frozen encoder are looked for in `encoders`.
@@ -33,14 +37,19 @@ impl Reconstructor {
         Ok(Self::new(load_checkpoint(Some(checkpoint), encoders, device)?, device))
     }
 
-    /// A model that is in memory, on `device`, already.
-    pub fn new(checkpoint: Checkpoint, device: &Device) -> Self {
+    /// A model on `device`, where its checkpoint is already.
+    pub(crate) fn new(checkpoint: Checkpoint, device: &Device) -> Self {
         Self { checkpoint, device: device.clone() }
     }
 
     /// The model.
-    pub fn checkpoint(&self) -> &Checkpoint {
+    pub(crate) fn checkpoint(&self) -> &Checkpoint {
         &self.checkpoint
+    }
+
+    /// How the model was made, as its checkpoint says it.
+    pub fn provenance(&self) -> &serde_json::Value {
+        &self.checkpoint.provenance
     }
 
     /// Where it computes.
@@ -75,7 +84,7 @@ impl Reconstructor {
     /// # Errors
     /// If what the checkpoint says of its use cannot be read.
     pub fn network_views(&self) -> Result<usize, Error> {
-        Ok(Settings::of(&self.checkpoint.provenance)?.network_views)
+        Ok(Settings::of(&self.checkpoint.provenance).lift()?.network_views)
     }
 
     /// Gaussians that the network makes by default, before the optimization; of a pixel-aligned model for as many views as it
@@ -95,7 +104,7 @@ impl Reconstructor {
         let config = &options.pipeline;
         config.validate()?;
         let kind = self.checkpoint.config.kind;
-        config.propose.flow.validate_for(kind).map_err(|e| e.within("propose.flow"))?;
+        config.propose.flow.validate_for(kind).map_err(|e| e.within("propose.flow").lift())?;
         let sampled = config.propose.init == Init::Flow && options.init.is_none();
         let only = |ok: bool, field: &str, expected: &str, found: String| match ok {
             true => Ok(()),
@@ -117,7 +126,7 @@ impl Reconstructor {
         if options.without_network && sampled {
             return Err(Error::input("propose.init", "fit where the network is left out", "flow"));
         }
-        let own = Settings::of(&self.checkpoint.provenance)?;
+        let own = Settings::of(&self.checkpoint.provenance).lift()?;
         if config.refine.is_some() && own.refiner.is_none() {
             return Err(Error::input("refine", "none: the model was not trained to refine", "some"));
         }
@@ -125,7 +134,7 @@ impl Reconstructor {
             Some(refine) => refine.compute,
             None => config.propose.flow.compute,
         };
-        require(compute, &self.device)
+        self.device.require(compute)
     }
 }
 
@@ -138,7 +147,7 @@ pub fn network_gaussians(
     provenance: &serde_json::Value,
     depth: u32,
 ) -> Result<usize, Error> {
-    let Settings { network_views, sample, refiner } = Settings::of(provenance)?;
+    let Settings { network_views, sample, refiner } = Settings::of(provenance).lift()?;
     let own = refiner.map_or(sample.lod_depth, |r| r.lod_depth);
     Ok(config.gaussians(own.unwrap_or(depth), network_views))
 }

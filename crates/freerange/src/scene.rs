@@ -2,17 +2,16 @@
 
 use std::path::Path;
 
-use freerange_camera::{FrameConfig, Up, View};
+use freerange_camera::{FrameConfig, View};
 use freerange_core::Note;
 use freerange_scene::{
-    LoadConfig, Loaded,
+    Loaded, SceneConfig, cut,
+    estimate::Hints,
     inspect::view_warnings,
-    load,
-    read::{Cameras, ReadConfig, cameras_with},
-    up_of,
+    read::{Cameras, cameras_with},
 };
 
-use crate::{Error, choose_views, others_show, to_canonical};
+use crate::{Error, choose_views, error::Lift, others::others_show, to_canonical};
 
 /// Photos with cameras, read and cut out.
 #[derive(Clone, Debug)]
@@ -26,17 +25,6 @@ pub struct Scene {
     pub frame: FrameConfig,
     /// What was understood, assumed, changed or left out, for the user to read.
     pub notes: Vec<Note>,
-}
-
-/// How a scene is read. The default takes what is there.
-#[derive(Clone, Debug, Default)]
-pub struct SceneConfig {
-    /// Which cameras, and how.
-    pub cameras: ReadConfig,
-    /// Masks, sizes, and what is known of the object's place.
-    pub photos: LoadConfig,
-    /// Which way is up; none: by the cameras' format, by what the object stands on, or by the cameras.
-    pub up: Option<Up>,
 }
 
 impl Scene {
@@ -54,7 +42,7 @@ impl Scene {
     /// # Errors
     /// As [`open`](Self::open).
     pub fn open_with(path: &Path, config: &SceneConfig) -> Result<Self, Error> {
-        Self::load(cameras_with(path, &config.cameras)?, config)
+        Self::load(cameras_with(path, &config.cameras).lift()?, config)
     }
 
     /// Reads the photos of cameras that are read already.
@@ -62,18 +50,10 @@ impl Scene {
     /// # Errors
     /// As [`open`](Self::open).
     pub fn load(cameras: Cameras, config: &SceneConfig) -> Result<Self, Error> {
-        let mut photos = config.photos.clone();
-        photos.hints.others = photos.hints.others.or(Some(others_show));
-        let loaded = load(&cameras, &photos)?;
-        let mut notes: Vec<Note> = cameras.notes.iter().chain(&loaded.notes).cloned().collect();
-        let up = config.up.unwrap_or_else(|| {
-            let (up, note) = up_of(&cameras, &loaded);
-            notes.extend(note);
-            up
-        });
-        let center = photos.hints.center.map(|c| c - cameras.origin);
-        let frame = FrameConfig { up, center, radius: photos.hints.radius, ..FrameConfig::default() };
-        Ok(Self { cameras, loaded, frame, notes })
+        let mut config = config.clone();
+        config.photos.hints.others = config.photos.hints.others.or(Some(others_show));
+        let read = freerange_scene::Scene::load(cameras, &config).lift()?;
+        Ok(Self { cameras: read.cameras, loaded: read.loaded, frame: read.frame, notes: read.notes })
     }
 
     /// The views to reconstruct from.
@@ -95,4 +75,13 @@ impl Scene {
         let shown = choose_views(self.views(), network_views)?;
         Ok(view_warnings(&self.loaded, &frame, &shown).into_iter().map(Note::warning).collect())
     }
+}
+
+/// Cuts the object out of views that are made, not read: those without a mask in their alpha get one, as the photos of a
+/// [`Scene`] do. `hints` say what is known of the object's place.
+///
+/// # Errors
+/// If no mask can be found.
+pub fn cut_out(views: &mut [View], hints: &Hints) -> Result<Vec<Note>, Error> {
+    cut(views, &Hints { others: hints.others.or(Some(others_show)), ..*hints }).lift()
 }

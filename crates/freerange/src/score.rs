@@ -5,6 +5,7 @@ use serde::Serialize;
 
 use crate::{
     Error,
+    error::Lift,
     pictures::{WHITE, render_view},
 };
 
@@ -42,11 +43,11 @@ pub fn score(cloud: &Cloud, views: &[View]) -> Result<Option<Scores>, Error> {
             // As a viewer would see it: clamped to the range of a picture.
             let render: Vec<f32> = render_view(cloud, &view.camera)?.iter().map(|x| x.clamp(0.0, 1.0)).collect();
             let truth = composite(&view.image, WHITE);
-            let psnr = capped_psnr(&render, &truth)?;
+            let psnr = capped_psnr(&render, &truth).lift()?;
             if psnr.is_nan() {
                 return Err(Error::input(format!("render of view {}", view.name), "finite colors", psnr));
             }
-            let ssim = ssim_3dgs(&render, &truth, w as usize, h as usize)?;
+            let ssim = ssim_3dgs(&render, &truth, w as usize, h as usize).lift()?;
             Ok(ViewScore { name: view.name.clone(), psnr, ssim })
         })
         .collect::<Result<Vec<_>, Error>>()?;

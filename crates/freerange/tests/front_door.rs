@@ -10,7 +10,7 @@ use freerange_camera::{FrameConfig, Window};
 use glam::{DQuat, DVec3};
 
 fn model() -> Reconstructor {
-    Reconstructor::shipped(&Device::flex()).unwrap()
+    Reconstructor::shipped(&Device::cpu()).unwrap()
 }
 
 fn scene() -> Scene {
@@ -318,11 +318,14 @@ fn what_cannot_be_used_is_named() {
     refused(&views, &with(&|o| o.pipeline.optimize.max_resolution = 300), &["optimize.max_resolution", "256"]);
     refused(&views, &with(&|o| o.pipeline.network_views = 0), &["network_views"]);
     refused(&views, &with(&|o| o.pipeline.refine = None), &["propose.init"]);
-    let flow = |o: &mut Options| (o.without_network, o.pipeline.propose.init) = (true, Init::Flow);
+    let flow = |o: &mut Options| {
+        *o = freerange::internal::without_network(o.clone(), true);
+        o.pipeline.propose.init = Init::Flow;
+    };
     refused(&views, &with(&flow), &["propose.init"]);
     let alone = model.run(&views[..1], &options, &mut go).unwrap_err().to_string();
     assert!(alone.contains("at least 2 views"), "{alone}");
-    assert!(matches!(model.run(&views[..0], &options, &mut go), Err(Error::Camera(_))));
+    assert!(matches!(model.run(&views[..0], &options, &mut go), Err(Error::Scene(_))));
     assert!(model.run(&views, &with(&|o| o.seeds.clear()), &mut go).unwrap().samples.is_empty());
 }
 

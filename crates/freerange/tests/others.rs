@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use freerange::{Scene, View, others_show};
+use freerange::{Scene, View, internal::others_show};
 use image::Rgba;
 
 fn bowl() -> Vec<View> {

@@ -1,6 +1,6 @@
 //! `freerange devices`
 
-use freerange::Api;
+use freerange::{Device, GpuApi};
 
 use crate::error::CliError;
 
@@ -13,7 +13,7 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> Result<(), CliError> {
-    let devices = freerange::devices();
+    let devices = Device::list();
     if args.json {
         println!("{}", serde_json::to_string_pretty(&devices).map_err(CliError::input)?);
         return Ok(());
@@ -47,7 +47,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
             if d.gpu { "" } else { "; a processor that plays a GPU: for tests" }
         );
     }
-    let missing: Vec<&str> = Api::ALL.into_iter().filter(|api| !api.compiled()).map(Api::name).collect();
+    let missing: Vec<&str> = GpuApi::ALL.into_iter().filter(|api| !api.compiled()).map(GpuApi::name).collect();
     if !missing.is_empty() {
         println!("not built in (cargo build --release --features NAME): {}", missing.join(", "));
     }

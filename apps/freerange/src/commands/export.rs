@@ -2,7 +2,10 @@
 
 use std::path::PathBuf;
 
-use freerange::{SETTINGS_SCHEMA, Settings, checkpoint_bytes, checkpoint_header, network_gaussians};
+use freerange::{
+    SETTINGS_SCHEMA,
+    internal::{Settings, checkpoint_bytes, checkpoint_header, network_gaussians},
+};
 use freerange_model::Header;
 
 use crate::{error::CliError, output::OutputFolder, runtime};

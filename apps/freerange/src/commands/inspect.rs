@@ -2,7 +2,11 @@
 
 use std::path::PathBuf;
 
-use freerange::{Settings, checkpoint_header, choose_views, to_canonical};
+use freerange::{
+    choose_views,
+    internal::{Settings, checkpoint_header},
+    to_canonical,
+};
 use freerange_camera::transforms_json;
 use freerange_scene::{
     inspect::{Inspection, inspect, sheet},
@@ -53,14 +57,12 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         Some(k) => usize::from(k),
         None => {
             let checkpoint = local_or_shipped(args.checkpoint.as_deref())?;
-            Settings::of(&checkpoint_header(checkpoint.as_deref())?.provenance)
-                .map_err(freerange::Error::from)?
-                .network_views
+            Settings::of(&checkpoint_header(checkpoint.as_deref())?.provenance)?.network_views
         }
     };
     let (frame, _) = to_canonical(&scene.loaded.views, &scene.frame)?;
     let shown = choose_views(&scene.loaded.views, views)?;
-    let found = inspect(&scene.cameras, &scene.loaded, &frame, &shown);
+    let found = inspect(&scene.cameras, &scene.loaded, &scene.notes, &frame, &shown);
     let output = OutputFolder::create("inspect", &args.output)?;
     output.picture("inspect.png", &sheet(&scene.loaded, &found))?;
     let json = serde_json::to_string_pretty(&found).map_err(CliError::failure)?;

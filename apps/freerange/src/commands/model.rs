@@ -2,7 +2,10 @@
 
 use std::path::PathBuf;
 
-use freerange::{EncoderPlaces, Settings, checkpoint_header, load_checkpoint, network_gaussians};
+use freerange::{
+    Device, EncoderPlaces,
+    internal::{Settings, checkpoint_header, find_encoder, load_checkpoint, network_gaussians},
+};
 use freerange_model::{Compute, Execution, ModelConfig, ModelInfo, WeightsOrigin, Workload};
 
 use crate::{
@@ -83,8 +86,7 @@ pub fn run(command: &Command) -> Result<(), CliError> {
         Command::Average(args) => {
             let encoders = EncoderPlaces::at(args.encoder_weights.clone());
             let load = |path: &PathBuf| {
-                let checkpoint =
-                    load_checkpoint(Some(&runtime::local(path)?), &encoders, &burn::tensor::Device::flex())?;
+                let checkpoint = load_checkpoint(Some(&runtime::local(path)?), &encoders, &Device::cpu())?;
                 Ok((path.clone(), checkpoint))
             };
             let all = args.inputs.iter().map(load).collect::<Result<Vec<_>, CliError>>()?;
@@ -92,8 +94,7 @@ pub fn run(command: &Command) -> Result<(), CliError> {
         }
         Command::Shrink(args) => {
             let encoders = EncoderPlaces::at(args.encoder_weights.clone());
-            let mut checkpoint =
-                load_checkpoint(Some(&runtime::local(&args.input)?), &encoders, &burn::tensor::Device::flex())?;
+            let mut checkpoint = load_checkpoint(Some(&runtime::local(&args.input)?), &encoders, &Device::cpu())?;
             if let Some(path) = &args.sampling {
                 let config = TrainConfig::load(path)?;
                 let Some(provenance) = checkpoint.provenance.as_object_mut() else {
@@ -166,7 +167,7 @@ fn info(args: &Info) -> Result<(), CliError> {
     if let Some((provenance, encoder)) = provenance {
         if let Some(origin) = encoder {
             println!("\nencoder weights {} (sha256 {})", origin.name, origin.sha256);
-            match EncoderPlaces::at(args.encoder_weights.clone()).find(&origin.name) {
+            match find_encoder(&EncoderPlaces::at(args.encoder_weights.clone()), &origin.name) {
                 Ok(found) => println!("found in {}", found.folder.display()),
                 Err(e) => println!("not found: {e}"),
             }

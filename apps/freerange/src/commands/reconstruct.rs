@@ -10,18 +10,18 @@ use std::{
 };
 
 use freerange::{
-    Cloud, Listed, PipelineConfig, Reconstructor, SETTINGS_SCHEMA, Scene, Scores, Stage, View,
+    Cloud, PipelineConfig, Reconstructor, SETTINGS_SCHEMA, Scene, Scores, Stage, View,
     pictures::{on_white, render_view, write_turntable},
-    score,
+    read_gaussians, score,
 };
 use freerange_camera::{
     FrameConfig, canonical_from_user,
     image_ops::{sheet, to_picture},
 };
-use freerange_core::Note;
+use freerange_core::{Note, NoteKind};
 use freerange_eval::memory::peak_memory;
 use freerange_formats::{Format, Frame, WriteOptions};
-use freerange_scene::write_colmap;
+use freerange_scene::{views_to_compare, write_colmap};
 use freerange_splat::{Splats, write_ply_at};
 use freerange_surface::{MeshConfig, MeshFormat, mesh_of, save};
 use serde::Serialize;
@@ -178,7 +178,7 @@ struct Program {
 
 impl Program {
     fn of(model: &Reconstructor, checkpoint_sha256: String) -> Self {
-        let device = Listed::of(model.device()).to_string();
+        let device = model.device().to_string();
         Self { version: env!("CARGO_PKG_VERSION"), commit: commit(), device, checkpoint_sha256 }
     }
 }
@@ -273,16 +273,9 @@ fn run_in(args: &Args, job: &Job) -> Result<(), CliError> {
 fn init(file: &Path, views: &[View], config: &FrameConfig) -> Result<Cloud, CliError> {
     // The canonical frame has +z up.
     let up = canonical_from_user(views, config)?.canonical_from_user.rotation.inverse() * glam::DVec3::Z;
-    let loaded = freerange_formats::read(file, Frame::with_up(up).unwrap_or_default())?;
-    loaded.notes.iter().for_each(|note| eprintln!("note: {}: {note}", file.display()));
-    let degree = loaded.splats.harmonics.degree();
-    if degree > 0 {
-        eprintln!(
-            "note: {}: colors that depend on the viewing direction (degree {degree}) are left out",
-            file.display()
-        );
-    }
-    Ok(loaded.splats.into_cloud())
+    let (cloud, notes) = read_gaussians(file, up)?;
+    notes.iter().for_each(|note| eprintln!("note: {}: {}", file.display(), note.text));
+    Ok(cloud)
 }
 
 /// Makes one scene and writes its results; the report, also as JSON. `begin`: when it was begun to be read; `commit`: is called before
@@ -299,12 +292,17 @@ fn reconstruct(
 ) -> Result<(SceneReport, String), CliError> {
     let warnings = scene.warnings(model.network_views()?)?;
     let origin = Some(scene.cameras.origin).filter(|o| *o != glam::DVec3::ZERO).map(|o| o.to_array());
-    let mut loaded = scene.loaded;
+    let (mut loaded, mut notes) = (scene.loaded, scene.notes);
+    notes.extend(warnings);
     // Only the cut-out photos are used from here on.
     drop(std::mem::take(&mut loaded.whole));
     let (mut inputs, mut further) = (loaded.views, loaded.further);
     if let Some(path) = &args.eval_scene {
-        further.extend(Photos::further(path, scene.cameras.origin)?);
+        let (views, said) = views_to_compare(path, scene.cameras.origin)?;
+        further.extend(views);
+        // What is missing there is told; how it was read is not of this scene.
+        let missing = |note: &Note| matches!(note.kind, NoteKind::Dropped | NoteKind::Warning);
+        notes.extend(said.into_iter().filter(missing));
     }
     let held = args.held_out()?.take(&mut inputs)?;
     let held_out = held.iter().map(|v| v.name.clone()).collect();
@@ -325,11 +323,7 @@ fn reconstruct(
     seconds.extend(result.seconds.iter().map(|(stage, seconds)| (stage.name(), *seconds)));
 
     let begin = Instant::now();
-    // The canonical frame has +z up.
-    let up = result.canonical_from_user.rotation.inverse() * glam::DVec3::Z;
-    let frame = Frame::with_up(up).unwrap_or_default();
-    let mut notes = scene.notes;
-    notes.extend(warnings);
+    let frame = Frame::with_up(result.up()).unwrap_or_default();
     let mut samples = Vec::new();
     for (i, sample) in result.samples.iter().enumerate() {
         let suffix = if i == 0 { String::new() } else { format!("-{i}") };

@@ -3,7 +3,8 @@
 use std::{net::IpAddr, ops::ControlFlow, path::PathBuf, process::Command, sync::Arc, time::Duration};
 
 use freerange::{
-    Camera, Cloud, Detect, Init, Quality, Reconstructor, View, choose_views, others_show, pictures::render_view,
+    Camera, Cloud, Detect, Init, Quality, Reconstructor, View, choose_views, internal::others_show,
+    pictures::render_view,
 };
 use freerange_camera::image_ops::to_picture;
 use freerange_core::IoError;
@@ -11,7 +12,6 @@ use freerange_scene::estimate::OthersShow;
 use freerange_serve::{
     Engine, EngineError, Example, JobOptions, Limits, Outcome, Scene, ServeConfig, ServeError, Server, Step,
 };
-use glam::DVec3;
 use image::RgbaImage;
 
 use crate::{error::CliError, pipeline::PipelineArgs, ranks::Job, signals::Signals};
@@ -208,10 +208,10 @@ impl Engine for Local {
             tell(&Step { stage, sample, done, total, loss, preview: &preview })
         });
         let result = run.map_err(engine_error)?;
+        let up = result.up().to_array();
         Ok(Outcome {
             samples: result.samples.into_iter().map(|s| (s.seed, s.gaussians)).collect(),
-            // The canonical frame has +z up.
-            up: (result.canonical_from_user.rotation.inverse() * DVec3::Z).to_array(),
+            up,
             notes: result.notes.into_iter().map(|note| note.text).collect(),
             seconds: result.seconds.iter().map(|(stage, s)| (stage.name().to_owned(), *s)).collect(),
         })

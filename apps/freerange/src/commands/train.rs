@@ -11,7 +11,10 @@ use std::{
 };
 
 use burn::tensor::Device;
-use freerange::{DeviceName, EncoderPlaces, checkpoint_sha256, load_checkpoint, require};
+use freerange::{
+    DeviceName, EncoderPlaces,
+    internal::{checkpoint_sha256, encoder_for_training, load_checkpoint, tensor_device},
+};
 use freerange_core::sha256_of;
 use freerange_flow::{
     FlowError,
@@ -90,24 +93,25 @@ fn train(args: &Args, job: &Job, interrupt: &Arc<Interrupt>, begin: Instant) -> 
     let prepared = || {
         let device = job.open(args.device)?;
         let config = TrainConfig::load(&args.config)?;
-        require(config.optimizer.compute, &device)?;
+        device.require(config.optimizer.compute)?;
         Ok((device, config))
     };
-    let (device, config) = job.together(prepared())?;
+    let (opened, config) = job.together(prepared())?;
+    let device = tensor_device(&opened);
     let output = match &args.output {
         Some(output) if !args.dry_run => output,
-        _ => return job.together(if job.first() { dry_run(&config, &device) } else { Ok(()) }),
+        _ => return job.together(if job.first() { dry_run(&config, device) } else { Ok(()) }),
     };
     if config.optimizer.compute == Compute::Auto {
-        say(&format!("computing in {}", config.optimizer.compute.on(&device)));
+        say(&format!("computing in {}", config.optimizer.compute.on(device)));
     }
-    let ranks = job.sums(args.sums, &device)?;
+    let ranks = job.sums(args.sums, device)?;
     let total = config.total_steps();
     let encoders = EncoderPlaces::at(args.encoder_weights.clone());
     let weights = || {
-        let encoder = encoders.for_training(&config.model.encoder)?;
+        let encoder = encoder_for_training(&encoders, &config.model.encoder)?;
         let path = local_or_shipped(args.initial.as_deref())?;
-        let initial = path.as_ref().map(|path| load_checkpoint(Some(path), &encoders, &device)).transpose()?;
+        let initial = path.as_ref().map(|path| load_checkpoint(Some(path), &encoders, &opened)).transpose()?;
         let identity = match job.world() {
             1 => Vec::new(),
             _ => identity(path.as_deref(), args.remeasure)?,
@@ -117,7 +121,7 @@ fn train(args: &Args, job: &Job, interrupt: &Arc<Interrupt>, begin: Instant) -> 
     let (encoder, initial, identity) = job.together(weights())?;
     let initial = initial.as_ref().map(|checkpoint| Initial { checkpoint, remeasure: args.remeasure });
     let among = Among { ranks, identity };
-    let trainer = Trainer::open_among(among, config, output, initial, encoder.as_ref(), &device, say);
+    let trainer = Trainer::open_among(among, config, output, initial, encoder.as_ref(), device, say);
     let mut trainer = job.together(trainer.map_err(CliError::from))?;
     let allowed = args.minutes.and_then(|minutes| Duration::try_from_secs_f64(60.0 * minutes.max(0.0)).ok());
     let over = allowed.and_then(|allowed| begin.checked_add(allowed));

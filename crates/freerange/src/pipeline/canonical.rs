@@ -4,13 +4,13 @@
 //! Masks and cameras give a first frame; where the scene does not already lie in the canonical one, a short fit corrects it
 //! (docs/experiments.md, "The frame"). Cost: a third of a second for that fit.
 
-use freerange_camera::{FrameConfig, Similarity, View, Window, canonical_from_user, inputs_around};
+use freerange_camera::{CanonicalFrame, FrameConfig, Similarity, View, Window, canonical_from_user, inputs_around};
 use freerange_core::Note;
 use freerange_fit::{frame_of, quick_fit};
 use freerange_splat::Cloud;
 
 use super::watch::Watch;
-use crate::{Detect, Error, Options, Stage};
+use crate::{Detect, Error, Options, Stage, error::Lift};
 
 /// The views of an object in the canonical frame.
 pub(crate) struct CanonicalScene {
@@ -83,7 +83,7 @@ impl CanonicalScene {
     /// Moves the frame to where the fit says that the object is.
     fn recenter(&mut self, shown: &[View]) -> Result<(), Error> {
         let Some(fit) = &mut self.fit else { return Ok(()) };
-        let correction = frame_of(fit, shown)?;
+        let correction = frame_of(fit, shown).lift()?;
         fit.transform(correction.scale, correction.rotation, correction.translation);
         self.photos.iter_mut().for_each(|view| view.camera = view.camera.transformed(&correction));
         self.canonical_from_user = correction.after(&self.canonical_from_user);
@@ -134,7 +134,7 @@ pub fn choose_views(views: &[View], most: usize) -> Result<Vec<usize>, Error> {
     }
     match places.len() <= most {
         true => Ok(places),
-        false => Ok(inputs_around(&centers, &places, most, RESTARTS, 0)?),
+        false => inputs_around(&centers, &places, most, RESTARTS, 0).lift(),
     }
 }
 
@@ -159,11 +159,8 @@ fn check_views(views: &[View]) -> Result<(), Error> {
 ///
 /// # Errors
 /// If there are fewer than two views, or they do not show one object from different places.
-pub fn to_canonical(
-    views: &[View],
-    config: &FrameConfig,
-) -> Result<(freerange_camera::CanonicalFrame, Vec<View>), Error> {
-    let frame = canonical_from_user(views, config)?;
+pub fn to_canonical(views: &[View], config: &FrameConfig) -> Result<(CanonicalFrame, Vec<View>), Error> {
+    let frame = canonical_from_user(views, config).lift()?;
     let moved = |v: &View| View { camera: v.camera.transformed(&frame.canonical_from_user), ..v.clone() };
     let canonical = views.iter().map(moved).collect();
     Ok((frame, canonical))

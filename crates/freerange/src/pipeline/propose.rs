@@ -42,12 +42,12 @@ pub(crate) fn propose(
         Init::Fit => fits(scene, targets, options, seed, watch),
         Init::Flow => {
             let flow = &config.flow;
-            let sampler = FlowSampler { checkpoint: model.checkpoint(), config: flow, device: model.device() };
+            let sampler = FlowSampler { checkpoint: model.checkpoint(), config: flow, device: &model.device().0 };
             let views = targets.network_views();
             let sample = |member: usize, progress: &mut refine::OnEstimate<'_>| {
                 // The first is what it is without the others, which draw from far away.
                 let seed = seed.wrapping_add((member as u64) << 32);
-                Ok(sampler.sample(&[views], &[seed], progress)?.remove(0))
+                Ok(sampler.sample(&[views], &[seed], progress).lift()?.remove(0))
             };
             refine::each(model, Stage::Propose, scene, [config.count, flow.steps], &sample, watch)
         }
@@ -87,5 +87,5 @@ fn fits(
         flow(&stopped)
     });
     stopped?;
-    Ok(fits.into_iter().collect::<Result<_, _>>()?)
+    fits.into_iter().collect::<Result<_, _>>().lift()
 }

@@ -6,7 +6,6 @@
 
 use std::ops::ControlFlow;
 
-use burn::tensor::Device;
 use freerange_core::side_by_side;
 use freerange_fit::tree_slice;
 use freerange_flow::sample::{Estimate, Refiner};
@@ -17,7 +16,7 @@ use super::{
     symmetry::Targets,
     watch::{Watch, flow},
 };
-use crate::{Error, Options, Reconstructor, Stage, progress::Preview};
+use crate::{Device, Error, Options, Reconstructor, Stage, error::Lift, progress::Preview};
 
 /// Hears of the network's estimate after each of its evaluations.
 pub(crate) type OnEstimate<'a> = dyn FnMut(&Estimate<'_>) -> ControlFlow<()> + 'a;
@@ -35,12 +34,12 @@ pub(crate) fn refine(
     if options.without_network {
         // As many Gaussians as the network would make.
         let depth = config.lod_depth.unwrap_or(model.checkpoint().depth);
-        return Ok(proposals.iter().map(|cloud| tree_slice(cloud, depth)).collect::<Result<_, _>>()?);
+        return proposals.iter().map(|cloud| tree_slice(cloud, depth).lift()).collect();
     }
-    let refiner = Refiner { checkpoint: model.checkpoint(), config, device: model.device() };
+    let refiner = Refiner { checkpoint: model.checkpoint(), config, device: &model.device().0 };
     let views = targets.network_views();
     let refine = |i: usize, progress: &mut OnEstimate<'_>| {
-        Ok(refiner.refine(&[views], std::slice::from_ref(&proposals[i]), progress)?.remove(0))
+        Ok(refiner.refine(&[views], std::slice::from_ref(&proposals[i]), progress).lift()?.remove(0))
     };
     each(model, Stage::Refine, scene, [proposals.len(), config.passes], &refine, watch)
 }
@@ -63,7 +62,7 @@ pub(crate) fn each(
         stopped = watch.report(stage, [done, total], None, preview.map(|p| (p, place)));
         flow(&stopped)
     };
-    let made: Result<Vec<Cloud>, Error> = if *model.device() == Device::flex() {
+    let made: Result<Vec<Cloud>, Error> = if *model.device() == Device::cpu() {
         let job = |i: usize| {
             move |tell: &mut dyn FnMut(_) -> ControlFlow<()>| {
                 make(i, &mut |estimate| tell((i == 0).then(|| estimate.clouds())))
@@ -77,7 +76,7 @@ pub(crate) fn each(
                 ControlFlow::Break(())
             }
         });
-        failed?;
+        failed.lift()?;
         made.into_iter().collect()
     } else {
         let one = |i: usize| make(i, &mut |estimate| report((i == 0).then_some(Preview::Network(estimate))));

@@ -18,7 +18,7 @@ use super::{
     CanonicalScene,
     watch::{Watch, flow},
 };
-use crate::{Detect, Error, PipelineConfig, Stage};
+use crate::{Detect, Error, PipelineConfig, Stage, error::Lift};
 
 /// Photos beyond which no symmetry is looked for: so many were measured, and the network sees at most twice as many.
 const MOST_PHOTOS: usize = 4;
@@ -69,12 +69,12 @@ pub(crate) fn detect(
     let shown = scene.network_views();
     let (mut axis, mut mirror, mut stopped) = (None, None, Ok(()));
     if turning > 0 {
-        axis = find_axis(&shown, own, fit, limits.revolution_threshold, 0, |done| report(done, &mut stopped))?;
+        axis = find_axis(&shown, own, fit, limits.revolution_threshold, 0, |done| report(done, &mut stopped)).lift()?;
         std::mem::replace(&mut stopped, Ok(()))?;
     }
     if mirroring > 0 {
         let report = |done| report(turning + done, &mut stopped);
-        mirror = find_mirror(&shown, own, fit, limits.reflection_threshold, 0, report)?;
+        mirror = find_mirror(&shown, own, fit, limits.reflection_threshold, 0, report).lift()?;
         stopped?;
     }
     watch.report(Stage::Symmetry, [total, total], None, None)?;

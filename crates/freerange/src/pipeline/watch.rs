@@ -6,7 +6,7 @@ use freerange_camera::Similarity;
 use freerange_fit::{FitError, FitProgress};
 use freerange_splat::Cloud;
 
-use crate::{Error, Progress, Stage, progress::Preview};
+use crate::{Error, Progress, Stage, error::Lift, progress::Preview};
 
 /// Hands reports to the caller's callback.
 pub(crate) struct Watch<'a> {
@@ -68,7 +68,7 @@ impl<'a> Watch<'a> {
             flow(&stopped)
         });
         stopped?;
-        Ok(cloud?)
+        cloud.lift()
     }
 }
 

@@ -5,7 +5,7 @@ mod sums;
 mod timer;
 mod whole;
 
-use freerange::{Compute, Device, DeviceName, Listed, require};
+use freerange::{Compute, DeviceInfo, DeviceName, internal::tensor_device};
 use serde::Serialize;
 
 use crate::{
@@ -111,15 +111,16 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         return sums::run(args);
     }
     let device = Job::alone().open(args.device)?;
-    let Listed { name, gpu, properties, .. } = Listed::of(&device);
-    let compute = args.precision.unwrap_or(Compute::Auto).on(&device);
-    require(compute, &device)?;
+    let DeviceInfo { name, gpu, properties, .. } = device.info();
+    let tensors = tensor_device(&device);
+    let compute = args.precision.unwrap_or(Compute::Auto).on(tensors);
+    device.require(compute)?;
     let sizes = match args.sizes.is_empty() {
         false => args.sizes.clone(),
         true if gpu => ["tiny", "base", "paper"].map(String::from).to_vec(),
         true => vec!["tiny".into()],
     };
-    let timer = timer::Timer { device: device.clone(), seconds: args.seconds };
+    let timer = timer::Timer { device: tensors.clone(), seconds: args.seconds };
     let mut report = BenchReport {
         device: name,
         hardware: properties.hardware,
@@ -214,6 +215,6 @@ fn ms(seconds: f64) -> String {
 }
 
 /// Bytes that the device's allocator has reserved; none where it does not tell.
-fn reserved(device: &Device) -> Option<u64> {
+fn reserved(device: &burn::tensor::Device) -> Option<u64> {
     device.memory_pool_usage().map(|usage| usage.bytes_reserved)
 }

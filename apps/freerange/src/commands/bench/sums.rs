@@ -21,7 +21,8 @@ fn measure(args: &Args, job: &Job) -> Result<(), CliError> {
     }
     let sizes = if args.sizes.is_empty() { vec!["tiny".to_owned(), "base".into()] } else { args.sizes.clone() };
     let device = job.together(job.open(args.device))?;
-    let ranks = job.sums(args.sums, &device)?;
+    let device = freerange::internal::tensor_device(&device);
+    let ranks = job.sums(args.sums, device)?;
     let counts = sizes.iter().map(|size| Ok((size.as_str(), numbers(size)?))).collect::<Result<Vec<_>, CliError>>();
     let out = Printer { quiet: !job.first() };
     let hardware = freerange::machine::processor();
@@ -35,7 +36,7 @@ fn measure(args: &Args, job: &Job) -> Result<(), CliError> {
     out.header(&["size", "numbers", "wire", "MB", "ms"]);
     for (size, count) in job.together(counts)? {
         for (wire, name, bytes) in [(Wire::F32, "f32", 4), (Wire::Bf16, "bf16", 2)] {
-            let seconds = seconds(&*ranks, count, wire, &device, args.seconds)?;
+            let seconds = seconds(&*ranks, count, wire, device, args.seconds)?;
             let cells = [
                 size.to_owned(),
                 count.to_string(),

@@ -233,7 +233,7 @@ mod tests {
 
     #[test]
     fn sets_apply_to_the_way_of_sampling() {
-        let model = freerange::Reconstructor::shipped(&freerange::Device::flex()).unwrap();
+        let model = freerange::internal::shipped(&freerange::Device::cpu()).unwrap();
         let fit = model.options().unwrap().pipeline;
         assert_eq!(sets(None, &fit, true).unwrap(), [Set::Inputs]);
         let mut flow = fit.clone();

@@ -2,7 +2,7 @@
 
 use std::{path::PathBuf, sync::Arc};
 
-use freerange::{Device, Listed, SETTINGS_SCHEMA, machine};
+use freerange::{Device, SETTINGS_SCHEMA, internal, machine};
 use freerange_core::Share;
 use freerange_eval::{
     Environment, Scorer, ScorerConfig,
@@ -153,7 +153,7 @@ impl RunArgs {
             MethodName::Model | MethodName::Start => {
                 let model = self.pipeline.open(device)?;
                 let mut options = self.pipeline.options(&model, self.samples)?;
-                options.without_network = self.method == MethodName::Start;
+                options = internal::without_network(options, self.method == MethodName::Start);
                 model.check(&options)?;
                 let sha256 = self.pipeline.checkpoint_sha256()?;
                 Method::Model { model: Arc::new(model), options: Box::new(options), sha256 }
@@ -180,7 +180,7 @@ impl RunArgs {
             dino: self.dino.clone(),
         };
         #[cfg(feature = "networks")]
-        let scorer = Scorer::open(&config, device)?;
+        let scorer = Scorer::open(&config, internal::tensor_device(device))?;
         #[cfg(not(feature = "networks"))]
         let scorer = {
             let _ = device; // of the networks
@@ -222,7 +222,7 @@ impl RunArgs {
             processor: machine::processor(),
             threads: std::thread::available_parallelism().map_or(1, usize::from),
             memory_bytes: machine::memory(),
-            device: Listed::of(device).to_string(),
+            device: device.to_string(),
         }
     }
 }

@@ -6,7 +6,7 @@ use std::{
     sync::Arc,
 };
 
-use freerange::{FrameConfig, Options, Reconstructor, Up, View, to_canonical, to_user};
+use freerange::{FrameConfig, Options, Reconstructor, Up, View, internal::is_without_network, to_canonical, to_user};
 use freerange_eval::{
     record::{Case, ViewSet},
     runner::{self, Reconstructed},
@@ -75,7 +75,7 @@ impl runner::Method for Method {
     fn label(&self) -> String {
         match self {
             Self::Model { options, .. } => {
-                let what = if options.without_network { "without the network" } else { "model" };
+                let what = if is_without_network(options) { "without the network" } else { "model" };
                 match options.pipeline.optimize.iterations {
                     0 => what.into(),
                     steps => format!("{what}, optimized {steps}"),
@@ -97,7 +97,7 @@ impl Method {
     pub fn settings(&self) -> Value {
         match self {
             Self::Model { options, sha256, .. } => json!({
-                "name": if options.without_network { "start" } else { "model" }, "checkpoint_sha256": sha256, "pipeline": options.pipeline,
+                "name": if is_without_network(options) { "start" } else { "model" }, "checkpoint_sha256": sha256, "pipeline": options.pipeline,
                 "seeds": options.seeds, "up": format!("{:?}", options.frame.up).to_lowercase(),
             }),
             Self::Fit { config, seeds, up } => json!({

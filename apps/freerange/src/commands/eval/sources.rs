@@ -5,11 +5,18 @@ use std::{
     path::{Path, PathBuf},
 };
 
+use freerange::{Scene, View};
 use freerange_build::{BuildConfig, Item, Items, render_views, true_mesh};
-use freerange_camera::{Scene, View};
+use freerange_core::{Note, NoteKind};
 use freerange_data::{ObjectSource, Shards, Split, Store};
 use freerange_eval::{EvalObject, MeshSurface, runner::Objects};
 use freerange_mesh::{LoadLimits, load_mesh};
+use freerange_scene::{
+    SceneConfig,
+    read::{ReadConfig, cameras_with},
+    views_to_compare,
+};
+use glam::DVec3;
 use serde_json::{Value, json};
 
 use crate::{
@@ -204,17 +211,39 @@ fn no_sets(name: &str, views: usize) -> CliError {
     CliError::input(format!("{name}: expected view sets for evaluation, found none: {views} views are too few"))
 }
 
+/// The views of a scene folder by role: inputs as `reconstruct` reads them, all others as it reads those to compare with.
 fn load_scene(name: &str, folder: &Path, [full, partial, validation]: &[String; 3]) -> Result<EvalObject, CliError> {
-    let read = |file: &str| -> Result<Vec<View>, CliError> {
+    let mut origin = None; // of all roles, the first one's
+    let mut inputs = |file: &str| -> Result<Vec<View>, CliError> {
         let path = folder.join(file);
-        let scene = Scene::load(&path)?;
-        Ok(scene.inputs.into_iter().chain(scene.further).collect())
+        if !path.is_file() {
+            return Ok(Vec::new());
+        }
+        let mut cameras = cameras_with(&path, &ReadConfig::default())?;
+        cameras.subtract(*origin.get_or_insert(cameras.origin));
+        let scene = Scene::load(cameras, &SceneConfig::default())?;
+        whole(&path, &scene.notes)?;
+        Ok(scene.loaded.views.into_iter().chain(scene.loaded.further).collect())
     };
-    let if_there = |file: &str| match folder.join(file).is_file() {
-        true => read(file),
-        false => Ok(Vec::new()),
+    let (around, beside) = (inputs(full)?, inputs(partial)?);
+    let compared = |file: &str| -> Result<Vec<View>, CliError> {
+        let path = folder.join(file);
+        let (views, notes) = views_to_compare(&path, origin.unwrap_or(DVec3::ZERO))?;
+        whole(&path, &notes)?;
+        Ok(views)
     };
     let all = "transforms.json";
-    let further = if [full, partial, validation].iter().any(|f| *f == all) { Vec::new() } else { if_there(all)? };
-    Ok(EvalObject::from_views(name, if_there(full)?, if_there(partial)?, read(validation)?, further)?)
+    let is_role = [full, partial, validation].iter().any(|file| *file == all);
+    let further = if !is_role && folder.join(all).is_file() { compared(all)? } else { Vec::new() };
+    Ok(EvalObject::from_views(name, around, beside, compared(validation)?, further)?)
+}
+
+/// Refuses scenes of which something is left out: numbers of fewer views, or of other masks, would be of another scene.
+fn whole(file: &Path, notes: &[Note]) -> Result<(), CliError> {
+    match notes.iter().find(|note| matches!(note.kind, NoteKind::Dropped | NoteKind::Warning)) {
+        Some(note) => {
+            Err(CliError::file(file, format!("expected all views, each with its mask; found: {}", note.text)))
+        }
+        None => Ok(()),
+    }
 }

@@ -1,9 +1,9 @@
 //! Whether poses that an engine found can be right. Reprojection errors do not tell: poses that are off by a third of a turn, on a mug whose
 //! pattern repeats, have as small ones.
 
-use freerange::{choose_views, others_show, to_canonical};
+use freerange::{choose_views, internal::others_show, to_canonical};
 use freerange_camera::{Camera, Lens, cameras_up, nearest_point};
-use freerange_scene::{LoadConfig, Loaded, SceneError, inspect::view_warnings, load, read::Cameras};
+use freerange_scene::{LoadConfig, Loaded, Scene, SceneConfig, SceneError, inspect::view_warnings, read::Cameras};
 use glam::{DMat3, DVec3};
 use serde::Serialize;
 
@@ -165,18 +165,17 @@ impl Judgement {
 
     /// Looks at the photos themselves: whether masks and table are consistent, as `inspect` does, and how well the others predict each.
     pub fn look_at_photos(&mut self, cameras: &Cameras) -> Result<(), CliError> {
-        let config = LoadConfig { max_side: 640, ..LoadConfig::default() };
-        let config = LoadConfig { hints: freerange_scene::estimate::Hints { others: None, ..config.hints }, ..config };
-        let loaded = match load(cameras, &config) {
-            Ok(loaded) => loaded,
+        // As `reconstruct` reads them, but small, and masks are not corrected by other views: that would hide wrong poses.
+        let photos = LoadConfig { max_side: 640, ..LoadConfig::default() };
+        let config = SceneConfig { photos, ..SceneConfig::default() };
+        let Scene { loaded, frame, .. } = match Scene::load(cameras.clone(), &config) {
+            Ok(scene) => scene,
             Err(e @ SceneError::NotCutOut { .. }) => {
                 self.refused.push(e.to_string());
                 return Ok(());
             }
             Err(e) => return Err(e.into()),
         };
-        let up = freerange_scene::up_of(cameras, &loaded).0;
-        let frame = freerange::FrameConfig { up, ..freerange::FrameConfig::default() };
         match to_canonical(&loaded.views, &frame) {
             Ok((frame, _)) => {
                 let shown = choose_views(&loaded.views, loaded.views.len())?;
