@@ -19,7 +19,7 @@ pub use frame::{
 };
 pub use freerange_core::image_ops;
 pub use lens::Lens;
-pub use plucker::{PatchLayout, plucker};
+pub use plucker::plucker;
 pub use scene::{Scene, load_cameras, transforms_json};
 pub use selection::{SelectionConfig, ViewSets, inputs_around, inputs_beside, k_means, select_views};
 pub use square::Window;

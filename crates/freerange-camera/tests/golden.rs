@@ -1,6 +1,6 @@
 //! Plücker coordinates and view selection against committed vectors.
 
-use freerange_camera::{Camera, PatchLayout, SelectionConfig, k_means, plucker, select_views};
+use freerange_camera::{Camera, SelectionConfig, k_means, plucker, select_views};
 use freerange_vectors::{Vectors, json};
 use glam::{DMat4, DVec3};
 use rand::SeedableRng;
@@ -21,16 +21,11 @@ fn plucker_coordinates() {
             cy: k[5],
             world_to_camera: DMat4::from_cols_slice(&matrix).transpose(),
         };
-        for (name, layout) in [
-            ("out/plucker_conv", PatchLayout::Stride(number("patch") as u32)),
-            ("out/plucker_scaled", PatchLayout::Scaled),
-        ] {
-            let expected = file.floats(name);
-            let found = plucker(&camera, number("w") as usize, number("h") as usize, layout);
-            assert_eq!(found.len(), expected.len());
-            for (f, e) in found.iter().zip(expected) {
-                assert!((f - e).abs() < 2e-6, "{case} {name}: {f} {e}");
-            }
+        let expected = file.floats("out/plucker_scaled");
+        let found = plucker(&camera, number("w") as usize, number("h") as usize);
+        assert_eq!(found.len(), expected.len());
+        for (f, e) in found.iter().zip(expected) {
+            assert!((f - e).abs() < 2e-6, "{case}: {f} {e}");
         }
         for (f, e) in camera.center().to_array().iter().zip(file.floats("out/origin")) {
             assert!((f - f64::from(*e)).abs() < 2e-6);

@@ -128,9 +128,6 @@ pub struct RefineConfig {
     pub coarse_size: u32,
     /// What keeps the cloud where no view looks.
     pub hold: HoldConfig,
-    /// Whether to start from one opaque layer of Gaussians on the surface of the clouds, in the photos' colors, where photos see it. An
-    /// experiment (`docs/research/surface.md`): off by default.
-    pub layer: bool,
     /// Seed of everything drawn.
     pub seed: u64,
 }
@@ -149,7 +146,6 @@ impl Default for RefineConfig {
             coarse: 0.0,
             coarse_size: 256,
             hold: HoldConfig::default(),
-            layer: false,
             seed: 0,
         }
     }

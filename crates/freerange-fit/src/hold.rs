@@ -32,7 +32,7 @@ struct Picture {
 }
 
 /// Cameras spread evenly over the sphere but for its poles (a Fibonacci spiral), looking at the origin.
-pub(crate) fn around(views: usize, size: u32, radius: f64) -> impl Iterator<Item = Camera> {
+fn around(views: usize, size: u32, radius: f64) -> impl Iterator<Item = Camera> {
     let golden = std::f64::consts::PI * (3.0 - 5f64.sqrt());
     let fov = 2.0 * ((1.0 / DISTANCE).asin().tan() / FILLED).atan();
     (0..views).map(move |i| {

@@ -5,7 +5,7 @@
 //! * [`find_mirror`]: the plane about which an object is its own mirror image, and [`mirrored`] photos of it.
 //! * [`find_axis`]: the axis about which it may be turned and keeps its outlines, and [`turned`] ones.
 //! * [`psnr_over_white`]: how well Gaussians show what views show.
-//! * [`refine`]: the same from a cloud that is already good, held where no view looks; [`refine_on_surface`]: what a known surface brings.
+//! * [`refine`]: the same from a cloud that is already good, held where no view looks.
 //!
 //! Plain Rust over the rasteriser's CPU functions; no tensor library.
 
@@ -24,7 +24,6 @@ mod quality;
 mod quick;
 mod refine;
 mod search;
-mod surface;
 #[cfg(test)]
 mod tests;
 mod views;
@@ -36,8 +35,8 @@ pub use fit::fit;
 pub use frame::frame_of;
 pub use mirror::{FoundMirror, Mirror, find_mirror, mirror_steps, mirrored};
 pub use quality::{over_white, psnr_over_white, render_over_white};
-pub use quick::{QuickFitConfig, polish, quick_fit, tree_slice};
-pub use refine::{refine, refine_on_surface};
+pub use quick::{QuickFitConfig, quick_fit, tree_slice};
+pub use refine::refine;
 pub use views::{Evidence, Outline};
 
 use freerange_splat::Cloud;

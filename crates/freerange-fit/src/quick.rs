@@ -68,7 +68,7 @@ pub fn quick_fit<'a>(
 ///
 /// # Errors
 /// Those of [`fit`].
-pub fn polish<'a>(
+pub(crate) fn polish<'a>(
     cloud: &Cloud,
     seen: impl Into<Evidence<'a>>,
     config: &QuickFitConfig,

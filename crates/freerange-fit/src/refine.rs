@@ -6,11 +6,9 @@ use crate::{
     hold::Hold,
     mcmc::split,
     objective::Objective,
-    surface::{Field, SIDE, layered, surface_of},
     views::Targets,
 };
 use freerange_splat::Cloud;
-use glam::DVec3;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use std::ops::ControlFlow;
@@ -24,8 +22,6 @@ const OUTLINES: u32 = 128;
 /// more view to agree with, though less. `others` are more clouds of the same object. These pictures are the mean of all:
 /// where guesses differ, their mean is nearer to the truth than most. For the same reason the refinement begins with as many
 /// of them in one place as there are to be Gaussians, each fainter, so that together they show about what one alone does.
-/// With a [`layer`](RefineConfig::layer), flat Gaussians take their place wherever a view sees the surface that all of them have in the mean: what several
-/// views show of it begins in one place.
 /// Outlines, where there are any, come beside the views at every other step.
 /// `progress` hears of every step, and ends with what there is by `ControlFlow::Break`. The same input gives the same bytes.
 ///
@@ -40,19 +36,7 @@ pub fn refine<'a>(
     progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Cloud, FitError> {
     config.check()?;
-    refine_from(cloud, others, seen.into(), config, None, progress)
-}
-
-/// The refinement itself; from a layer on `surface`, if there is one.
-fn refine_from(
-    cloud: &Cloud,
-    others: &[Cloud],
-    seen: Evidence<'_>,
-    config: &RefineConfig,
-    surface: Option<&Field>,
-    progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
-) -> Result<Cloud, FitError> {
-    let photos = seen.views;
+    let seen = seen.into();
     let targets = Targets::new(seen.views, config.render_size)?;
     let first = (config.coarse * config.steps as f64) as usize;
     let coarse = (first > 0).then(|| Targets::new(seen.views, Some(config.coarse_size))).transpose()?;
@@ -62,12 +46,7 @@ fn refine_from(
     let clouds = std::iter::once(cloud).chain(others).map(|cloud| checked(cloud, usize::MAX));
     let clouds = clouds.collect::<Result<Vec<_>, _>>()?;
     let hold = Hold::new(&clouds, &config.hold)?;
-    let mut start = together(&clouds, config.gaussians);
-    if let Some(field) = surface {
-        start = layered(&start, field, photos, config.gaussians)?;
-    } else if config.layer {
-        start = layered(&start, &surface_of(&clouds, photos, config.hold.radius)?, photos, config.gaussians)?;
-    }
+    let start = together(&clouds, config.gaussians);
     let fit = config.fit(start.len());
     fit.check()?;
     let mut rng = ChaCha8Rng::seed_from_u64(config.seed);
@@ -90,23 +69,6 @@ fn refine_from(
     };
     let of_step = |step| coarse.as_ref().filter(|_| step < first).unwrap_or(&targets);
     optimise(start, of_step, &fit, &mut rng, more, progress)
-}
-
-/// As [`refine`] from a layer, but on a known surface instead of the one that it finds: `distance` is a point's distance from it, negative inside, in
-/// the frame of the views. It is for studies of what a better surface could bring.
-///
-/// # Errors
-/// As [`refine`].
-pub fn refine_on_surface<'a>(
-    cloud: &Cloud,
-    distance: impl Fn(DVec3) -> f64 + Sync,
-    seen: impl Into<Evidence<'a>>,
-    config: &RefineConfig,
-    progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
-) -> Result<Cloud, FitError> {
-    config.check()?;
-    let field = Field::new(config.hold.radius, SIDE, distance);
-    refine_from(cloud, &[], seen.into(), config, Some(&field), progress)
 }
 
 /// As many of `clouds` as `most` Gaussians allow, but the first in any case, in one place. Each Gaussian becomes what relocation

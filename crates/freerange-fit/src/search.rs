@@ -9,7 +9,7 @@ use freerange_splat::Cloud;
 use glam::DVec3;
 use rayon::prelude::*;
 
-use crate::{Evidence, FitError, FitProgress, QuickFitConfig, polish, quick_fit, views::Targets};
+use crate::{Evidence, FitError, FitProgress, QuickFitConfig, quick::polish, quick_fit, views::Targets};
 
 /// Longest side, in pixels, of the outlines that symmetries are judged by.
 pub(crate) const OUTLINE: u32 = 64;

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use freerange_camera::{
-    PatchLayout, Similarity, View, Window,
+    Similarity, View, Window,
     image_ops::{resize_area, shrunk_size, to_f32_rgba},
     plucker,
 };
@@ -19,8 +19,8 @@ use rayon::prelude::*;
 
 use crate::{
     FlowError,
-    config::{FrameJitter, LossConfig, Stage, StartLoss},
-    path::{guess_weight, render_weight},
+    config::{FrameJitter, LossConfig, Stage},
+    path::{cosine_time, render_weight},
     photometric::{Images, Targets},
     symmetry::Symmetry,
 };
@@ -82,7 +82,7 @@ impl Conditioning {
                 let on_white = |p: &[f32; 4], c: usize| if c < 3 { p[c] * p[3] + 1.0 - p[3] } else { p[3] };
                 let all = to_f32_rgba(&view.image);
                 let pixels = all.as_chunks::<4>().0.iter().flat_map(|p| (0..channels).map(move |c| on_white(p, c)));
-                let rays = |side| plucker(&view.camera, side, side, PatchLayout::Scaled);
+                let rays = |side| plucker(&view.camera, side, side);
                 ((pixels.collect::<Vec<f32>>(), rays(grid)), rays(side))
             })
             .unzip();
@@ -115,9 +115,8 @@ pub struct Batch {
     pub data: Tensor<3>,
     /// Noise, paired with them. `[b, n, 14]`
     pub noise: Tensor<3>,
-    /// Where the paths are at their times, apart from noise: the data, or between a quick fit and the data. `[b, n, 14]`
-    pub clean: Tensor<3>,
-    /// The quick fits that the paths started from, paired with the data; none if they started from noise. `[b, n, 14]`
+    /// The initial fits that are refined, paired with the data; none if paths start from noise. With them noise and times are
+    /// 0. `[b, n, 14]`
     pub fits: Option<Tensor<3>>,
     /// How many estimates the network makes, each fed to the next, before the one that is trained.
     pub estimates: usize,
@@ -149,14 +148,12 @@ impl Batch {
         device: &Device,
     ) -> Result<Self, FlowError> {
         let (b, n) = (objects.len(), 1usize << stage.depth);
-        let start = loss.start.filter(|start| rng.random::<f32>() < start.share);
+        let refinement = loss.refinement.filter(|refinement| rng.random::<f32>() < refinement.share);
         let estimates = draw_estimates(loss, rng);
-        let held_at_start = start.filter(|start| start.hold > 0.0 && rng.random::<f32>() < start.hold);
-        let fits = start.map(|_| same_fit(objects, stage.depth, loss.held_views, rng)).transpose()?;
+        let fits = refinement.map(|_| same_fit(objects, stage.depth, loss.held_views, rng)).transpose()?;
         let inputs = rng.random_range(loss.input_views.0..=loss.input_views.1);
         let one_sided = rng.random::<f32>() < loss.one_sided;
-        let common =
-            Common { depth: stage.depth, loss, normalization, start, hold: held_at_start.is_some(), inputs, one_sided };
+        let common = Common { depth: stage.depth, loss, normalization, inputs, one_sided };
         let mut rows = Rows::default();
         for (i, object) in objects.iter().enumerate() {
             rows.draw(object, fits.as_ref().map(|fits| fits[i]), &common, rng)?;
@@ -174,15 +171,13 @@ impl Batch {
         let held = if loss.held_views > 0 { Some(at(&held_views, render_size)?) } else { None };
         let shape = [b, n, channel::COUNT];
         let tensor = |values: Vec<f32>| Tensor::<3>::from_data(TensorData::new(values, shape), device);
-        let data = tensor(rows.data);
         Ok(Self {
-            clean: if fits.is_some() { tensor(rows.on_path) } else { data.clone() },
             fits: fits.is_some().then(|| tensor(rows.guesses)),
             estimates,
-            data,
+            data: tensor(rows.data),
             noise: tensor(rows.noise),
-            render_weights: match held_at_start.and_then(|start| start.render) {
-                Some(weight) => vec![weight; b],
+            render_weights: match refinement {
+                Some(refinement) => vec![refinement.render_weight; b],
                 None => rows.t.iter().map(|&t| render_weight(t)).collect(),
             },
             t: rows.t,
@@ -215,10 +210,6 @@ struct Common<'a> {
     depth: u32,
     loss: &'a LossConfig,
     normalization: &'a Normalization,
-    /// Paths start from quick fits.
-    start: Option<StartLoss>,
-    /// All times are where such paths start.
-    hold: bool,
     /// Input views of an object without a fit.
     inputs: usize,
     one_sided: bool,
@@ -229,7 +220,6 @@ struct Common<'a> {
 struct Rows<'a> {
     data: Vec<f32>,
     noise: Vec<f32>,
-    on_path: Vec<f32>,
     guesses: Vec<f32>,
     t: Vec<f32>,
     conditional: Vec<f32>,
@@ -263,7 +253,7 @@ impl<'a> Rows<'a> {
         common: &Common<'_>,
         rng: &mut ChaCha8Rng,
     ) -> Result<(), FlowError> {
-        let &Common { depth, loss, normalization, start, hold, inputs, one_sided } = common;
+        let &Common { depth, loss, normalization, inputs, one_sided } = common;
         let symmetry = Symmetry::draw(loss.symmetries, rng);
         let slice = match fit {
             Some(fit) => &fit.mended,
@@ -276,11 +266,13 @@ impl<'a> Rows<'a> {
             _ => seen_so(slice),
         };
         let values = (1usize << depth) * channel::COUNT;
-        let mut epsilon: Vec<f32> = (0..values).map(|_| StandardNormal.sample(rng)).collect();
-        let first = start.map_or(0.0, |s| s.time);
-        let time = if hold { first } else { first + (1.0 - first) * loss.time.draw(rng) };
+        let (mut epsilon, time) = match fit {
+            // All that the network can say comes from the fit and the images.
+            Some(_) => (vec![0.0; values], 0.0),
+            None => ((0..values).map(|_| StandardNormal.sample(rng)).collect(), cosine_time(rng.random())),
+        };
         // A fit is made of the images: there is no way without them from it.
-        let blind = rng.random::<f32>() < loss.unconditional && start.is_none();
+        let blind = rng.random::<f32>() < loss.unconditional && fit.is_none();
         self.t.push(time);
         self.conditional.push(if blind { 0.0 } else { 1.0 });
         self.backgrounds.push(draw_background(rng));
@@ -303,12 +295,7 @@ impl<'a> Rows<'a> {
                 if frame != Similarity::IDENTITY {
                     guess.transform(frame.scale, frame.rotation, frame.translation);
                 }
-                let guess = normalization.normalize(&guess);
-                loss.coupling.pair(&mut epsilon, &guess); // as when sampling
-                epsilon.iter_mut().for_each(|e| *e *= start.map_or(1.0, |s| s.noise));
-                let w = guess_weight(time, first);
-                self.on_path.extend(clean.iter().zip(&guess).map(|(x, g)| x + w * (g - x)));
-                self.guesses.extend(guess);
+                self.guesses.extend(normalization.normalize(&guess));
             }
         }
         self.data.extend(clean);

@@ -11,7 +11,6 @@ use serde::{Deserialize, de::Error};
 use crate::{
     FlowError, ValidationConfig,
     coupling::Coupling,
-    path::TimeSchedule,
     ranks::Wire,
     sample::{FlowConfig, GradientAt, RefinerConfig},
 };
@@ -43,7 +42,7 @@ pub struct TrainConfig<M = ()> {
     /// How the finished model is sampled from, unless the user says otherwise; kept in the checkpoint.
     #[serde(default)]
     pub sample: FlowConfig,
-    /// How the finished model refines initial fits, if it learns to (`loss.start`); kept in the checkpoint.
+    /// How the finished model refines initial fits, if it learns to (`loss.refinement`); kept in the checkpoint.
     #[serde(default)]
     pub refiner: Option<RefinerConfig>,
 }
@@ -55,9 +54,9 @@ pub struct DataConfig<M = ()> {
     /// Shards made by `freerange data build`: a folder (in a file, its path is relative to the file), or a URL (`s3://`,
     /// `gs://`, `https://`). Without it, objects are generated on the fly, without end.
     pub shards: Option<String>,
-    /// Train on the shards that are finished by now where the folder is still being made; a run that goes on later takes
-    /// those of then, and is no longer the one never stopped.
-    pub partial: bool,
+    /// Train on the shards that are finished by now where the folder is still being made. Resuming takes those finished in
+    /// the meantime too: a resumed run is then not bit-identical to an uninterrupted one.
+    pub allow_incomplete: bool,
     /// Objects held in memory, from which each batch is drawn.
     pub window: usize,
     /// Objects that leave the window, and new ones that enter it, with every step.
@@ -78,7 +77,7 @@ impl<M: Default> Default for DataConfig<M> {
     fn default() -> Self {
         Self {
             shards: None,
-            partial: false,
+            allow_incomplete: false,
             window: 64,
             fresh: 2,
             workers: 1,
@@ -119,16 +118,14 @@ pub struct LossConfig {
     pub min_remaining: f32,
     /// Probability that a sample is trained without images, for classifier-free guidance.
     pub unconditional: f32,
-    /// How times are drawn.
-    pub time: TimeSchedule,
     /// How noise is paired with Gaussians.
     pub coupling: Coupling,
     /// Tokens of Gaussians picked at random instead of neighbours in the tree (an ablation of the paper).
     pub random_patches: bool,
     /// Fewest and most input views; the number is drawn for each batch.
     pub input_views: (usize, usize),
-    /// Batches that start from quick fits of their input views, which the objects must have; left out: none.
-    pub start: Option<StartLoss>,
+    /// Batches that refine initial fits of their input views, which the objects must have; left out: none.
+    pub refinement: Option<RefinementLoss>,
     /// Share of the batches in which the network is fed its own estimate, made without a gradient just before
     /// (`model.estimate_channels`).
     pub self_conditioning: f32,
@@ -144,30 +141,16 @@ pub struct LossConfig {
     pub symmetries: Symmetries,
 }
 
-/// How training starts from quick fits. Such batches have the input views of their fits, and lead to what these should
-/// have been: [`InputFit::mended`](freerange_data::InputFit).
+/// Training of a [`Refiner`](crate::sample::Refiner): batches without noise, at time 0, in which the network is fed an initial
+/// fit as an estimate. They have the input views of their fits, and lead to what these should have been:
+/// [`InputFit::mended`](freerange_data::InputFit).
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct StartLoss {
+pub struct RefinementLoss {
     /// Share of the batches that do; the others start from pure noise, with views drawn anew.
     pub share: f32,
-    /// The time to which fits are mixed with noise: see [`guess_weight`](crate::path::guess_weight). 0: they start from pure
-    /// noise, and the fit is but an estimate fed to the network.
-    pub time: f32,
-    /// Factor on the noise. 0: what comes out is a function of the fit and the images.
-    #[serde(default = "one")]
-    pub noise: f32,
-    /// Of those batches, the share at the start itself: all that the network can say there comes from the images and the fit,
-    /// whereas a sample on the way to the data shows where it goes. What a [`Refiner`](crate::sample::Refiner) wants.
-    #[serde(default)]
-    pub hold: f32,
-    /// Weight of the rendering losses at the start; left out: that of its time, `w(t)`.
-    #[serde(default)]
-    pub render: Option<f32>,
-}
-
-fn one() -> f32 {
-    1.0
+    /// Weight of the rendering losses in them.
+    pub render_weight: f32,
 }
 
 /// Standard deviations of the normal distributions that a training object's frame is moved by; 0: not at all.
@@ -203,11 +186,10 @@ impl Default for LossConfig {
             gradient_size: 512,
             min_remaining: crate::path::MIN_REMAINING,
             unconditional: 0.1,
-            time: TimeSchedule::Cosine,
             coupling: Coupling::Independent,
             random_patches: false,
             input_views: (4, 4),
-            start: None,
+            refinement: None,
             self_conditioning: 0.0,
             estimates: 1,
             gradient_at: GradientAt::Noisy,
@@ -485,25 +467,22 @@ impl<M: Making> TrainConfig<M> {
             l.self_conditioning.to_string(),
         )?;
         check((1..=16).contains(&l.estimates), "loss.estimates", "1 to 16", l.estimates.to_string())?;
-        if let Some(start) = l.start {
-            check((0.0..=1.0).contains(&start.share), "loss.start.share", "0 to 1", start.share.to_string())?;
-            check((0.0..=2.0).contains(&start.noise), "loss.start.noise", "0 to 2", start.noise.to_string())?;
-            check((0.0..=1.0).contains(&start.hold), "loss.start.hold", "0 to 1", start.hold.to_string())?;
+        if let Some(RefinementLoss { share, render_weight }) = l.refinement {
+            check((0.0..=1.0).contains(&share), "loss.refinement.share", "0 to 1", share.to_string())?;
             check(
-                start.render.is_none_or(|w| w.is_finite() && w >= 0.0),
-                "loss.start.render",
+                render_weight.is_finite() && render_weight >= 0.0,
+                "loss.refinement.render_weight",
                 "a finite number, 0 or more",
-                format!("{:?}", start.render),
+                render_weight.to_string(),
             )?;
-            check((0.0..1.0).contains(&start.time), "loss.start.time", "0 to below 1", start.time.to_string())?;
             check(
                 !l.random_patches,
                 "loss.random_patches",
-                "false with loss.start, whose fits are in the tree's order",
+                "false with loss.refinement, whose fits are in the tree's order",
                 "true".into(),
             )?;
             let made = self.data.shards.is_some() || self.data.making.input_fits() > 0;
-            check(made, "data.object.input_fits", "at least 1 with loss.start", "0".into())?;
+            check(made, "data.object.input_fits", "at least 1 with loss.refinement", "0".into())?;
         }
         for (field, value) in
             [("loss.frame_jitter.scale", l.frame_jitter.scale), ("loss.frame_jitter.center", l.frame_jitter.center)]
@@ -520,7 +499,6 @@ impl<M: Making> TrainConfig<M> {
             check((8..=2048).contains(&size), field, "8 to 2048", size.to_string())?;
         }
         self.validate_kind()?;
-        l.time.validate()?;
         self.optimizer.validate()?;
         let lanes = self.data.lanes;
         check((1..=4096).contains(&lanes), "data.lanes", "1 to 4096", lanes.to_string())?;
@@ -566,7 +544,7 @@ impl<M: Making> TrainConfig<M> {
         check(l.unconditional == 0.0, "loss.unconditional", "0", l.unconditional.to_string())?;
         check(!l.random_patches, "loss.random_patches", "false", "true".into())?;
         check(l.coupling == Coupling::Independent, "loss.coupling", "independent", "tree".into())?;
-        check(l.start.is_none(), "loss.start", "none", "one".into())?;
+        check(l.refinement.is_none(), "loss.refinement", "none", "one".into())?;
         check(self.refiner.is_none(), "refiner", "none", "one".into())?;
         if kind == ModelKind::LatentTokens {
             let most = self.model.gaussians(0, 0);

@@ -74,32 +74,32 @@ const LAMBDA_PG: f32 = 10.0;
 /// Settings of schema 1, in which one table held sampling from noise, network refinement and what follows it. The latter
 /// belongs to the pipeline's presets now. Fields that were left out had the defaults of then, which are still these.
 fn converted(value: &Value) -> Result<(FlowConfig, Option<RefinerConfig>), FlowError> {
-    let get = |names: &[&str]| names.iter().find_map(|name| value.get(name)).filter(|v| !v.is_null());
-    let fixed_point = get(&["solver"]).is_some_and(|s| s == "hold");
-    if get(&["start"]).is_some() != fixed_point {
+    let get = |name: &str| value.get(name).filter(|v| !v.is_null());
+    let fixed_point = get("solver").is_some_and(|s| s == "hold");
+    if get("start").is_some() != fixed_point {
         let expected = "a start from initial fits with fixed-point refinement, or neither";
         return Err(Invalid::new(field("sample"), expected, value).into());
     }
-    let pick = |from: &[(&str, &[&str])]| -> Value {
+    let pick = |from: &[(&str, &str)]| -> Value {
         let found = from.iter().filter_map(|(now, then)| Some(((*now).to_owned(), get(then)?.clone())));
         Value::Object(found.collect())
     };
     let mut flow: FlowConfig = parsed(
         "sample",
         &pick(&[
-            ("steps", &["steps"]),
-            ("lod_depth", &["depth"]),
-            ("cfg_scale", &["cfg_scale", "guidance"]),
-            ("lambda_pg", &["lambda_pg", "photometric"]),
-            ("gradient_at", &["gradient_at"]),
-            ("gradient_size", &["gradient_size"]),
-            ("background", &["background"]),
-            ("coupling", &["coupling"]),
-            ("compute", &["compute"]),
+            ("steps", "steps"),
+            ("lod_depth", "depth"),
+            ("cfg_scale", "cfg_scale"),
+            ("lambda_pg", "lambda_pg"),
+            ("gradient_at", "gradient_at"),
+            ("gradient_size", "gradient_size"),
+            ("background", "background"),
+            ("coupling", "coupling"),
+            ("compute", "compute"),
         ]),
     )?;
     // Guidance along a rescaled gradient is no more.
-    if get(&["photometric_step"]).is_some_and(|s| s == "scaled") && (flow.lambda_pg > 0.0 || fixed_point) {
+    if get("photometric_step").is_some_and(|s| s == "scaled") && (flow.lambda_pg > 0.0 || fixed_point) {
         flow.lambda_pg = LAMBDA_PG;
     }
     if !fixed_point {
@@ -108,11 +108,11 @@ fn converted(value: &Value) -> Result<(FlowConfig, Option<RefinerConfig>), FlowE
     let refiner = parsed(
         "sample",
         &pick(&[
-            ("passes", &["steps"]),
-            ("retokenize_every", &["regroup"]),
-            ("lod_depth", &["depth"]),
-            ("gradient_size", &["gradient_size"]),
-            ("compute", &["compute"]),
+            ("passes", "steps"),
+            ("retokenize_every", "regroup"),
+            ("lod_depth", "depth"),
+            ("gradient_size", "gradient_size"),
+            ("compute", "compute"),
         ]),
     )?;
     let defaults = FlowConfig::default();
@@ -150,7 +150,7 @@ mod tests {
             "steps": 12, "solver": "hold", "regroup": 4, "depth": 11, "start": start, "cfg_scale": 1.0, "lambda_pg": 0.0,
             "photometric_step": "scaled", "photometric_repeats": 8, "gradient_at": "estimate", "gradient_size": 128,
             "background": "white", "coupling": "tree", "mirror": 1.05, "turn": 0.85, "refine": 500, "ensemble": 4,
-            "from_noise": { "steps": 40, "solver": "euler", "photometric": 0.035, "mend": 4 }
+            "from_noise": { "steps": 40, "solver": "euler", "lambda_pg": 0.035, "mend": 4 }
         });
         let found = Settings::of(&json!({ "sample": sample, "configuration": { "loss": { "input_views": [2, 6] } } }));
         let found = found.unwrap();
@@ -161,7 +161,7 @@ mod tests {
         assert_eq!((found.sample.steps, found.sample.cfg_scale, found.sample.lambda_pg), (40, 1.0, LAMBDA_PG));
         assert_eq!(found.sample.background, FlowConfig::default().background);
 
-        let paper = Settings::of(&json!({ "sample": { "guidance": 1.5, "steps": 20 } })).unwrap();
+        let paper = Settings::of(&json!({ "sample": { "cfg_scale": 1.5, "steps": 20 } })).unwrap();
         assert_eq!((paper.sample.cfg_scale, paper.sample.lambda_pg, paper.sample.steps), (1.5, 50.0, 20));
         assert!(paper.refiner.is_none() && paper.network_views == PAPERS_VIEWS);
         let other = json!({ "sample": { "solver": "euler", "start": { "time": 0.3 } } });

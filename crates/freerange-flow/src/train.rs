@@ -46,7 +46,7 @@ pub fn step(
     }
     let b = batch.t.len();
     let t = Tensor::<1>::from_floats(batch.t.as_slice(), device);
-    let noisy = interpolate(batch.noise, batch.clean, t.clone());
+    let noisy = interpolate(batch.noise, batch.data.clone(), t.clone());
 
     let tokens = batch.conditioning.encode(model) * batch.conditional.clone();
     // What is known besides the noisy sample: an earlier estimate of the clean one, and the photometric gradient there.

@@ -2,7 +2,7 @@
 
 use freerange_flow::{
     ValidationConfig,
-    config::{FrameJitter, LossConfig, OptimizerConfig, Stage, StartLoss, Symmetries},
+    config::{FrameJitter, LossConfig, OptimizerConfig, RefinementLoss, Stage, Symmetries},
     sample::{FlowConfig, RefinerConfig},
 };
 use freerange_model::{Dinov2Config, ModelConfig, PatchConfig};
@@ -25,13 +25,13 @@ fn missing<T: Serialize + DeserializeOwned>(value: &T) -> Vec<String> {
 
 #[test]
 fn every_field_of_every_setting_is_recorded() {
-    let start: StartLoss = serde_json::from_value(json!({ "share": 0.5, "time": 0.0 })).unwrap();
+    let refinement = RefinementLoss { share: 0.5, render_weight: 20.0 };
     let stage: Stage = serde_json::from_value(json!({ "depth": 4, "image_size": 16, "batch": 2, "steps": 1 })).unwrap();
     let found = [
         missing(&FlowConfig::default()),
         missing(&RefinerConfig::default()),
         missing(&LossConfig::default()),
-        missing(&start),
+        missing(&refinement),
         missing(&FrameJitter::default()),
         missing(&Symmetries::default()),
         missing(&OptimizerConfig::default()),

@@ -358,7 +358,7 @@ fn a_fit_is_refined() {
         .replace(
             "[loss]",
             "[loss]\nself_conditioning = 0.5\nestimates = 2\ngradient_at = \"estimate\"\n\
-             start = { share = 1.0, time = 0.0, noise = 0.0, hold = 1.0, render = 50.0 }",
+             refinement = { share = 1.0, render_weight = 50.0 }",
         )
         .replace(
             "[sample]",

@@ -167,6 +167,19 @@ impl Checkpoint {
     }
 }
 
+/// The configuration in a checkpoint's metadata. Earlier ones name two more fields, which had one useful value each: that is
+/// passed over, any other refused as unknown.
+fn configuration(text: &str) -> serde_json::Result<ModelConfig> {
+    let mut json: serde_json::Value = serde_json::from_str(text)?;
+    for (table, field, value) in [("", "final_layer", "adaln".into()), ("/encoder", "patch_hidden", 0.into())] {
+        let table = json.pointer_mut(table).and_then(serde_json::Value::as_object_mut);
+        if let Some(table) = table.filter(|table| table.get(field) == Some(&value)) {
+            table.remove(field);
+        }
+    }
+    serde_json::from_value(json)
+}
+
 /// What the metadata of a checkpoint say.
 #[derive(Clone, Debug)]
 pub struct Header {
@@ -197,7 +210,7 @@ impl Header {
             return Err(bad(format!("version is `{}`, this program reads {VERSION}", get("version")?)));
         }
         let invalid = |key: &str, e: serde_json::Error| bad(format!("metadata `{key}`: {e}"));
-        let config: ModelConfig = serde_json::from_str(get("config")?).map_err(|e| invalid("config", e))?;
+        let config = configuration(get("config")?).map_err(|e| invalid("config", e))?;
         config.validate().map_err(|e| bad(e.to_string()))?;
         let gradient_rms: [f32; CHANNELS] =
             serde_json::from_str(get("gradient_rms")?).map_err(|e| invalid("gradient_rms", e))?;
@@ -244,5 +257,22 @@ impl Header {
                 }
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn fields_that_are_gone_may_have_their_one_value() {
+        let of = |last: &str, hidden: u32| {
+            let encoder = format!(r#"{{ "kind": "patch", "patch_size": 8, "patch_hidden": {hidden} }}"#);
+            configuration(&format!(r#"{{ "hidden": 64, "final_layer": "{last}", "encoder": {encoder} }}"#))
+        };
+        let config = of("adaln", 0).unwrap();
+        assert_eq!((config.hidden, config.encoder.patch_size()), (64, 8));
+        assert!(of("linear", 0).unwrap_err().to_string().contains("final_layer"));
+        assert!(of("adaln", 4).unwrap_err().to_string().contains("patch_hidden"));
     }
 }

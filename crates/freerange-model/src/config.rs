@@ -106,8 +106,6 @@ pub struct ModelConfig {
     pub time_features: usize,
     /// Width of the sinusoidal embedding of a patch's position; a multiple of 4.
     pub position_features: usize,
-    /// What stands before the output projection.
-    pub final_layer: FinalLayer,
     /// Whether the photometric gradient is an input beside the noisy Gaussians.
     pub gradient_channels: bool,
     /// Whether an earlier estimate of the clean Gaussians is one, too (self-conditioning: Chen et al. 2022; not the
@@ -143,8 +141,6 @@ pub struct PatchConfig {
     pub patch_size: u32,
     /// 3 (RGB) or 4 (RGB and alpha).
     pub channels: usize,
-    /// Width of a small network on the pixels of each patch; 0: the pixels themselves.
-    pub patch_hidden: usize,
 }
 
 /// Architecture of a DINOv2; the defaults are `facebook/dinov2-base`. And where its weights lie.
@@ -181,16 +177,6 @@ pub struct Dinov2Config {
     pub random: bool,
 }
 
-/// What stands before the output projection.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum FinalLayer {
-    /// A layer norm modulated by the time, as in DiT.
-    Adaln,
-    /// Nothing.
-    Linear,
-}
-
 impl Default for ModelConfig {
     fn default() -> Self {
         Self {
@@ -207,7 +193,6 @@ impl Default for ModelConfig {
             volume: None,
             time_features: 256,
             position_features: 32,
-            final_layer: FinalLayer::Adaln,
             gradient_channels: true,
             estimate_channels: false,
             observation_channels: false,
@@ -219,7 +204,7 @@ impl Default for ModelConfig {
 
 impl Default for PatchConfig {
     fn default() -> Self {
-        Self { patch_size: 16, channels: 4, patch_hidden: 0 }
+        Self { patch_size: 16, channels: 4 }
     }
 }
 
@@ -308,7 +293,6 @@ impl EncoderConfig {
     /// Appearance features per patch, before position, colour and ray are appended.
     pub fn features(&self) -> usize {
         match self {
-            Self::Patch(c) if c.patch_hidden > 0 => c.patch_hidden,
             Self::Patch(c) => c.channels * (c.patch_size * c.patch_size) as usize,
             Self::Dinov2(c) => c.hidden,
         }
@@ -452,7 +436,6 @@ impl ModelConfig {
             EncoderConfig::Patch(c) => {
                 within("encoder.patch_size", c.patch_size as usize, 1, 256)?;
                 within("encoder.channels", c.channels, 3, 4)?;
-                within("encoder.patch_hidden", c.patch_hidden, 0, 16_384)?;
             }
             EncoderConfig::Dinov2(c) => c.validate()?,
         }

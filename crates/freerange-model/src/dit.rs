@@ -10,7 +10,7 @@ use burn::{
 
 use crate::{
     ModelConfig, ModelError,
-    config::{CHANNELS, FinalLayer, ModelKind, PLACE},
+    config::{CHANNELS, ModelKind, PLACE},
     kernels::block::BlockSettings,
     layers::{Builder, Init, Linear, NormWeight, Source},
     ops::{self, Compute},
@@ -287,13 +287,13 @@ impl Dit {
                 .map(|i| Block::build(config, &format!("{prefix}blocks.{i}"), builder))
                 .collect::<Result<_, ModelError>>()?,
             output: Output {
-                adaln: match (config.final_layer, config.kind.one_pass()) {
-                    (FinalLayer::Adaln, false) => Some(builder.linear(&name("final.adaln"), d, 2 * d, Init::Zeros)?),
-                    _ => None,
+                adaln: match config.kind.one_pass() {
+                    false => Some(builder.linear(&name("final.adaln"), d, 2 * d, Init::Zeros)?),
+                    true => None,
                 },
-                norm: match (config.final_layer, config.kind.one_pass()) {
-                    (FinalLayer::Adaln, true) => Some(builder.param(&name("final.norm"), [2, d], Init::Zeros)?),
-                    _ => None,
+                norm: match config.kind.one_pass() {
+                    false => None,
+                    true => Some(builder.param(&name("final.norm"), [2, d], Init::Zeros)?),
                 },
                 linear: builder.linear(&name("final.linear"), d, config.output_channels(), Init::Zeros)?,
             },
@@ -418,15 +418,14 @@ impl Dit {
         }
         let [b, _, d] = x.dims();
         let modulation = match (&self.output.adaln, &self.output.norm) {
-            (Some(adaln), _) => Some(adaln.forward(silu_c)),
-            (None, Some(norm)) => Some(norm.val().reshape([1, 2 * d]).repeat_dim(0, b)),
-            (None, None) => None,
+            (Some(adaln), _) => adaln.forward(silu_c),
+            (None, norm) => {
+                let norm = norm.as_ref().expect("a model without a time has a norm of its own");
+                norm.val().reshape([1, 2 * d]).repeat_dim(0, b)
+            }
         };
-        if let Some(modulation) = modulation {
-            let [shift, scale] = chunks(modulation);
-            x = ops::modulated_norm(x, shift, scale, Compute::F32);
-        }
-        self.output.linear.forward(x)
+        let [shift, scale] = chunks(modulation);
+        self.output.linear.forward(ops::modulated_norm(x, shift, scale, Compute::F32))
     }
 
     /// What a model that predicts in one pass says of each token that becomes Gaussians, before decoding.

@@ -21,7 +21,7 @@
 
 use std::fmt;
 
-use crate::{Compute, Dinov2Config, EncoderConfig, FinalLayer, ModelConfig};
+use crate::{Compute, Dinov2Config, EncoderConfig, ModelConfig};
 
 /// One tensor of the model.
 #[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
@@ -112,13 +112,6 @@ fn linear(out: &mut Vec<TensorInfo>, name: &str, inputs: usize, outputs: usize) 
 pub fn tensors(config: &ModelConfig) -> Vec<TensorInfo> {
     let (d, f) = (config.hidden, config.ffn_width());
     let mut out = Vec::new();
-    if let EncoderConfig::Patch(c) = &config.encoder
-        && c.patch_hidden > 0
-    {
-        let pixels = c.channels * (c.patch_size * c.patch_size) as usize;
-        linear(&mut out, "encoder.patch.0", pixels, c.patch_hidden);
-        linear(&mut out, "encoder.patch.2", c.patch_hidden, c.patch_hidden);
-    }
     out.push(TensorInfo { name: "dit.registers".to_owned(), shape: vec![config.registers, d] });
     linear(&mut out, "dit.img_in", config.image_token_width(), d);
     let one_pass = config.kind.one_pass();
@@ -144,10 +137,9 @@ pub fn tensors(config: &ModelConfig) -> Vec<TensorInfo> {
         linear(&mut out, &name("ffn.proj_in"), d, 2 * f);
         linear(&mut out, &name("ffn.proj_out"), f, d);
     }
-    match (config.final_layer, one_pass) {
-        (FinalLayer::Adaln, false) => linear(&mut out, "dit.final.adaln", d, 2 * d),
-        (FinalLayer::Adaln, true) => out.push(TensorInfo { name: "dit.final.norm".to_owned(), shape: vec![2, d] }),
-        (FinalLayer::Linear, _) => {}
+    match one_pass {
+        false => linear(&mut out, "dit.final.adaln", d, 2 * d),
+        true => out.push(TensorInfo { name: "dit.final.norm".to_owned(), shape: vec![2, d] }),
     }
     linear(&mut out, "dit.final.linear", d, config.output_channels());
     out
@@ -318,10 +310,6 @@ fn forward_flops(config: &ModelConfig, workload: Workload) -> f64 {
 fn encoder_flops(config: &ModelConfig) -> f64 {
     let patches = config.patches_per_side().pow(2) as f64;
     match &config.encoder {
-        EncoderConfig::Patch(c) if c.patch_hidden > 0 => {
-            let pixels = c.channels as f64 * f64::from(c.patch_size).powi(2);
-            2.0 * patches * (pixels + c.patch_hidden as f64) * c.patch_hidden as f64
-        }
         EncoderConfig::Patch(_) => 0.0,
         EncoderConfig::Dinov2(c) => {
             let (d, f) = (c.hidden as f64, c.ffn_width() as f64);
@@ -385,12 +373,10 @@ mod tests {
 
     #[test]
     fn names_and_shapes_are_the_modules() {
-        for (final_layer, patch_hidden, registers, gradient_channels) in
-            [(FinalLayer::Adaln, 0, 4, true), (FinalLayer::Linear, 5, 0, false)]
-        {
+        for (registers, gradient_channels) in [(4, true), (0, false)] {
             let config = ModelConfig {
                 image_size: 8,
-                encoder: EncoderConfig::Patch(PatchConfig { patch_size: 4, channels: 3, patch_hidden }),
+                encoder: EncoderConfig::Patch(PatchConfig { patch_size: 4, channels: 3 }),
                 hidden: 24,
                 blocks: 3,
                 heads: 4,
@@ -399,7 +385,6 @@ mod tests {
                 gaussians_per_token: 4,
                 time_features: 6,
                 position_features: 8,
-                final_layer,
                 gradient_channels,
                 ..ModelConfig::default()
             };
@@ -416,7 +401,7 @@ mod tests {
     fn models_of_one_pass_are_counted_as_built() {
         let small = ModelConfig {
             image_size: 8,
-            encoder: EncoderConfig::Patch(PatchConfig { patch_size: 4, channels: 4, patch_hidden: 0 }),
+            encoder: EncoderConfig::Patch(PatchConfig { patch_size: 4, channels: 4 }),
             hidden: 24,
             blocks: 2,
             heads: 4,
@@ -501,7 +486,7 @@ mod tests {
     fn flops_of_a_model_small_enough_to_count_by_hand() {
         let config = ModelConfig {
             image_size: 4,
-            encoder: EncoderConfig::Patch(PatchConfig { patch_size: 4, channels: 3, patch_hidden: 0 }),
+            encoder: EncoderConfig::Patch(PatchConfig { patch_size: 4, channels: 3 }),
             hidden: 2,
             blocks: 1,
             heads: 1,
@@ -510,7 +495,6 @@ mod tests {
             gaussians_per_token: 2,
             time_features: 4,
             position_features: 0,
-            final_layer: FinalLayer::Linear,
             gradient_channels: true,
             ..ModelConfig::default()
         };

@@ -22,8 +22,8 @@ mod weights;
 
 pub use checkpoint::{Checkpoint, Header, Precision};
 pub use config::{
-    CHANNELS, Dinov2Config, EncoderConfig, FinalLayer, ModelConfig, ModelKind, OBSERVATION, PLACE, PLUCKER,
-    PatchConfig, VolumeConfig,
+    CHANNELS, Dinov2Config, EncoderConfig, ModelConfig, ModelKind, OBSERVATION, PLACE, PLUCKER, PatchConfig,
+    VolumeConfig,
 };
 pub use dit::{Dit, Feedback, time_embedding};
 pub use encoder::{Dinov2, ImageEncoder, WeightsOrigin, position_embedding};

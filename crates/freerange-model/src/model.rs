@@ -58,7 +58,7 @@ impl FreeRange {
         builder: &mut Builder<'_, S>,
     ) -> Result<Self, ModelError> {
         Ok(Self {
-            encoder: ImageEncoder::build(config, dinov2, "encoder.", builder)?,
+            encoder: ImageEncoder::new(config, dinov2),
             dit: Dit::build(config, config.image_token_width(), "dit.", builder)?,
             kind: config.kind,
             decoder: Decoder::new(config),
@@ -192,13 +192,9 @@ pub(crate) fn check_dinov2(config: &ModelConfig, dinov2: &Dinov2) -> Result<(), 
 /// PyTorch would call these layers of a `Sequential` by number, and our field cannot be called `final`.
 pub(crate) fn torch_name(path: &[String]) -> String {
     let mut name = path.join(".");
-    for (ours, torch) in [
-        ("dit.t_mlp.first.", "dit.t_mlp.0."),
-        ("dit.t_mlp.second.", "dit.t_mlp.2."),
-        ("dit.output.", "dit.final."),
-        ("encoder.appearance.Patch.first.", "encoder.patch.0."),
-        ("encoder.appearance.Patch.second.", "encoder.patch.2."),
-    ] {
+    for (ours, torch) in
+        [("dit.t_mlp.first.", "dit.t_mlp.0."), ("dit.t_mlp.second.", "dit.t_mlp.2."), ("dit.output.", "dit.final.")]
+    {
         if let Some(rest) = name.strip_prefix(ours) {
             name = format!("{torch}{rest}");
         }
@@ -208,7 +204,7 @@ pub(crate) fn torch_name(path: &[String]) -> String {
 
 /// Frozen weights are no parameters.
 fn is_frozen(path: &[String]) -> bool {
-    path.starts_with(&["encoder", "appearance", "Dinov2"].map(str::to_owned))
+    path.starts_with(&["encoder", "dinov2"].map(str::to_owned))
 }
 
 struct Collector {

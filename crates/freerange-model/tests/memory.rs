@@ -13,7 +13,7 @@ const LOAD: Workload = Workload { batch: 2, views: 4, gaussians: 1024 };
 fn config() -> ModelConfig {
     ModelConfig {
         image_size: 224,
-        encoder: EncoderConfig::Patch(PatchConfig { patch_size: 16, channels: 4, patch_hidden: 0 }),
+        encoder: EncoderConfig::Patch(PatchConfig { patch_size: 16, channels: 4 }),
         hidden: 192,
         blocks: 8,
         heads: 3,

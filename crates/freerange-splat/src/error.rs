@@ -83,14 +83,6 @@ pub enum SplatError {
         /// What was asked for.
         found: usize,
     },
-    /// A cloud cannot be cut into patches.
-    #[error("expected a number of Gaussians that patches of {patch} divide, found {gaussians}")]
-    Patch {
-        /// Gaussians per patch.
-        patch: usize,
-        /// Gaussians.
-        gaussians: usize,
-    },
     /// Normalisation statistics that cannot be used.
     #[error("normalisation, channel {channel} ({name}), {field}: expected {expected}, found {found}")]
     Normalization {

@@ -10,7 +10,6 @@ mod error;
 mod harmonics;
 mod merge;
 mod normalize;
-pub mod patch;
 mod ply;
 mod ply_columns;
 mod ply_compressed;

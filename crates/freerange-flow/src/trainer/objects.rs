@@ -32,7 +32,7 @@ pub(super) fn normalization(
 
 /// The part `split` of the shards at `place`.
 fn shards<M>(config: &TrainConfig<M>, place: &str, split: Split) -> Result<Shards, FlowError> {
-    let open = if config.data.partial { Shards::open_finished } else { Shards::open };
+    let open = if config.data.allow_incomplete { Shards::open_finished } else { Shards::open };
     Ok(open(&Store::open(place)?, &config.depths(), Some(split))?)
 }
 

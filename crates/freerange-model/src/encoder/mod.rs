@@ -4,8 +4,6 @@
 
 pub(crate) mod bicubic;
 pub(crate) mod dinov2;
-mod patch;
-pub(crate) use patch::patches;
 
 use burn::{
     module::Module,
@@ -13,73 +11,48 @@ use burn::{
 };
 
 pub use dinov2::{Dinov2, WeightsOrigin};
-use patch::PatchMlp;
 
-use crate::{
-    EncoderConfig, ModelConfig, ModelError, PLUCKER,
-    layers::{Builder, Source},
-    ops::Compute,
-};
-
-/// What a patch is turned into.
-#[derive(Module, Debug)]
-#[allow(clippy::large_enum_variant)] // there is one per model
-enum Appearance {
-    /// Its pixels, or what a small network of the model's own makes of them.
-    Patch(Option<PatchMlp>),
-    /// The features of a frozen, published network; none while that is taken out.
-    Dinov2(Option<Dinov2>),
-}
+use crate::{EncoderConfig, ModelConfig, PLUCKER, ops::Compute};
 
 /// Turns posed images into image tokens.
 #[derive(Module, Debug)]
 pub struct ImageEncoder {
-    appearance: Appearance,
+    /// The frozen, published network whose features a patch is turned into; none while that is taken out.
+    dinov2: Option<Dinov2>,
+    /// Whether there is one; a patch is its pixels otherwise.
+    published: bool,
     patch_size: usize,
     channels: usize,
     position_features: usize,
 }
 
 impl ImageEncoder {
-    pub(crate) fn build<S: Source>(
-        config: &ModelConfig,
-        dinov2: Option<Dinov2>,
-        prefix: &str,
-        builder: &mut Builder<'_, S>,
-    ) -> Result<Self, ModelError> {
-        let appearance = match &config.encoder {
-            EncoderConfig::Patch(c) if c.patch_hidden > 0 => {
-                Appearance::Patch(Some(PatchMlp::build(c, prefix, builder)?))
-            }
-            EncoderConfig::Patch(_) => Appearance::Patch(None),
-            EncoderConfig::Dinov2(_) => Appearance::Dinov2(dinov2),
-        };
-        Ok(Self {
-            appearance,
+    pub(crate) fn new(config: &ModelConfig, dinov2: Option<Dinov2>) -> Self {
+        let published = matches!(config.encoder, EncoderConfig::Dinov2(_));
+        Self {
+            dinov2: dinov2.filter(|_| published),
+            published,
             patch_size: config.encoder.patch_size() as usize,
             channels: config.encoder.channels(),
             position_features: config.position_features,
-        })
+        }
     }
 
     /// The frozen DINOv2, if this encoder has one.
     pub fn dinov2(&self) -> Option<&Dinov2> {
-        match &self.appearance {
-            Appearance::Dinov2(dinov2) => dinov2.as_ref(),
-            Appearance::Patch(_) => None,
-        }
+        self.dinov2.as_ref()
     }
 
     pub(crate) fn set_compute(&mut self, compute: Compute) {
-        if let Appearance::Dinov2(Some(dinov2)) = &mut self.appearance {
+        if let Some(dinov2) = &mut self.dinov2 {
             dinov2.set_compute(compute);
         }
     }
 
     pub(crate) fn replace_dinov2(&mut self, dinov2: Option<Dinov2>) -> Option<Dinov2> {
-        match &mut self.appearance {
-            Appearance::Dinov2(own) => std::mem::replace(own, dinov2),
-            Appearance::Patch(_) => None,
+        match self.published {
+            true => std::mem::replace(&mut self.dinov2, dinov2),
+            false => None,
         }
     }
 
@@ -101,17 +74,16 @@ impl ImageEncoder {
         assert_eq!(plucker.dims(), [b, views, rows, columns, PLUCKER], "one ray per patch");
         let tokens = views * rows * columns;
 
-        let patches = patch::patches(images.clone(), p) * 2.0 - 1.0; // [b, tokens, p * p * channels]
+        let patches = patches(images.clone(), p) * 2.0 - 1.0; // [b, tokens, p * p * channels]
         let colour = patches.clone().reshape([b, tokens, p * p, channels]).mean_dim(2).reshape([b, tokens, channels]);
-        let features = match &self.appearance {
-            Appearance::Dinov2(dinov2) => {
-                let dinov2 = dinov2.as_ref().expect("the frozen encoder is in its place");
+        let features = match self.published {
+            true => {
+                let dinov2 = self.dinov2.as_ref().expect("the frozen encoder is in its place");
                 let images = images.reshape([b * views, h, w, channels]).permute([0, 3, 1, 2]);
                 let features = dinov2.patch_features(dinov2::imagenet_normalised(images)).detach();
                 features.reshape([b, tokens, dinov2.hidden()])
             }
-            Appearance::Patch(Some(mlp)) => mlp.forward(patches),
-            Appearance::Patch(None) => patches,
+            false => patches,
         };
         let position = position_embedding(rows, columns, self.position_features);
         let position = TensorData::new(position, [1, rows * columns, self.position_features]);
@@ -119,6 +91,14 @@ impl ImageEncoder {
         let rays = plucker.reshape([b, tokens, PLUCKER]);
         Tensor::cat(vec![features, position, colour.narrow(2, 0, 3), rays], 2)
     }
+}
+
+/// `[b, views, h, w, c]` to `[b, views * h/p * w/p, p * p * c]`: view by view, row by row; pixels of a patch row by row.
+pub(crate) fn patches(images: Tensor<5>, p: usize) -> Tensor<3> {
+    let [b, views, h, w, c] = images.dims();
+    let (rows, columns) = (h / p, w / p);
+    let x = images.reshape([b * views * rows, p, columns, p * c]).swap_dims(1, 2); // [b v rows, columns, p, p c]
+    x.reshape([b, views * rows * columns, p * p * c])
 }
 
 /// Sin-cos embedding of each patch's row and column (Vaswani et al. 2017, in two dimensions), `[rows * columns,

@@ -5,13 +5,13 @@ use burn::{
 
 use super::{Golden, devices, half_devices, numbers, path};
 use crate::{
-    Compute, Dit, EncoderConfig, Feedback, FinalLayer, FreeRange, ModelConfig, OBSERVATION, PLACE, PatchConfig,
+    Compute, Dit, EncoderConfig, Feedback, FreeRange, ModelConfig, OBSERVATION, PLACE, PatchConfig,
     dit::{Parts, time_embedding},
     layers::Builder,
     weights::TensorFile,
 };
 
-fn golden_dit(name: &str, final_layer: FinalLayer, image_channels: usize, device: &Device) -> Dit {
+fn golden_dit(name: &str, image_channels: usize, device: &Device) -> Dit {
     let config = ModelConfig {
         hidden: 32,
         blocks: 2,
@@ -20,7 +20,6 @@ fn golden_dit(name: &str, final_layer: FinalLayer, image_channels: usize, device
         registers: 2,
         gaussians_per_token: 2,
         time_features: 16,
-        final_layer,
         ..ModelConfig::default()
     };
     let path = path(&format!("dit/{name}.weights.safetensors"));
@@ -58,13 +57,13 @@ impl ModuleVisitor for GradientCheck<'_> {
     }
 }
 
-fn whole(name: &str, final_layer: FinalLayer, device: &Device, recompute: bool) {
+fn whole(name: &str, device: &Device, recompute: bool) {
     let device = device.clone().autodiff();
     let golden = Golden::read(&format!("dit/{name}.safetensors"));
     let input = |part: &str| golden.tensor::<3>(&format!("in/{part}"), &device).require_grad();
     let (z, gradient, images) = (input("z"), input("grad_channels"), input("img"));
     let t = golden.tensor::<1>("in/t", &device).require_grad();
-    let mut dit = golden_dit(name, final_layer, images.dims()[2], &device);
+    let mut dit = golden_dit(name, images.dims()[2], &device);
     dit.set_recompute(recompute);
 
     golden.check("out/cond", dit.condition(t.clone()), 1e-4);
@@ -87,16 +86,11 @@ fn whole(name: &str, final_layer: FinalLayer, device: &Device, recompute: bool) 
 }
 
 #[test]
-fn matches_the_reference_with_a_modulated_output() {
+fn matches_the_reference() {
     for device in devices() {
-        whole("dit_adaln_final", FinalLayer::Adaln, &device, false);
-    }
-}
-
-#[test]
-fn matches_the_reference_with_a_plain_output() {
-    for device in devices() {
-        whole("dit_linear_final", FinalLayer::Linear, &device, true);
+        for recompute in [false, true] {
+            whole("dit_adaln_final", &device, recompute);
+        }
     }
 }
 
@@ -106,7 +100,7 @@ fn half_precision_stays_near() {
         let golden = Golden::read("dit/dit_adaln_final.safetensors");
         let input = |part: &str| golden.tensor::<3>(&format!("in/{part}"), &device);
         let images = input("img");
-        let mut dit = golden_dit("dit_adaln_final", FinalLayer::Adaln, images.dims()[2], &device);
+        let mut dit = golden_dit("dit_adaln_final", images.dims()[2], &device);
         dit.set_compute(compute);
         let out = dit.forward(input("z"), Some(input("grad_channels")), images, golden.tensor("in/t", &device));
         golden.check("out/zhat1", out, 2e-2);
@@ -196,7 +190,7 @@ fn pieces(ops: &Parts, device: &Device) {
 fn small(p: usize, gradient_channels: bool) -> ModelConfig {
     ModelConfig {
         image_size: 8,
-        encoder: EncoderConfig::Patch(PatchConfig { patch_size: 4, channels: 3, patch_hidden: 0 }),
+        encoder: EncoderConfig::Patch(PatchConfig { patch_size: 4, channels: 3 }),
         hidden: 16,
         blocks: 2,
         heads: 2,
@@ -296,7 +290,7 @@ fn pairs_of_gaussians_may_be_reordered() {
     let golden = Golden::read("dit/dit_adaln_final.safetensors");
     let input = |part: &str| golden.tensor::<3>(&format!("in/{part}"), &device);
     let (z, gradient, images) = (input("z"), input("grad_channels"), input("img"));
-    let dit = golden_dit("dit_adaln_final", FinalLayer::Adaln, images.dims()[2], &device);
+    let dit = golden_dit("dit_adaln_final", images.dims()[2], &device);
     let turn = |x: Tensor<3>| Tensor::cat(vec![x.clone().narrow(1, 4, 8), x.narrow(1, 0, 4)], 1);
     let t = golden.tensor::<1>("in/t", &device);
     let out = dit.forward(z.clone(), Some(gradient.clone()), images.clone(), t.clone());

@@ -21,7 +21,7 @@ fn config(kind: ModelKind) -> ModelConfig {
     ModelConfig {
         kind,
         image_size: SIDE as u32,
-        encoder: EncoderConfig::Patch(PatchConfig { patch_size: 4, channels: 4, patch_hidden: 0 }),
+        encoder: EncoderConfig::Patch(PatchConfig { patch_size: 4, channels: 4 }),
         hidden: 16,
         blocks: 2,
         heads: 2,

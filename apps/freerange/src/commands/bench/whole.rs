@@ -221,6 +221,8 @@ pub fn train(timer: &Timer, size: &str, compute: Compute, peak_tflops: f64) -> R
     for stage in &config.stages {
         let mut one = config.clone();
         one.stages = vec![Stage { steps: u64::MAX / 2, ..stage.clone() }];
+        // Objects made on the fly, without fits to refine: a step takes as long.
+        (one.data.shards, one.loss.refinement) = (None, None);
         one.data.statistics_objects = 4;
         one.data.window = stage.batch.min(8);
         one.data.fresh = 0;
