@@ -4,8 +4,9 @@
 
 use std::{error::Error, ops::ControlFlow, path::Path};
 
-use freerange::{Scene, to_canonical, to_user, write_ply};
+use freerange::{Scene, to_canonical, to_user};
 use freerange_fit::{FitConfig, Rates, fit};
+use freerange_splat::write_ply;
 
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
