@@ -6,7 +6,8 @@ SCENE/transforms_full.json -o RESULT/out` and `freerange render RESULT/out/gauss
 -o RESULT/renders` wrote. Needs Pillow. Writes OUT.png.
 
 --compare: labeled columns instead: inputs, the baseline fit, the result, the ground truth (docs/images/comparison.jpg);
-writes OUT.jpg. RESULT/fit holds what `freerange render RESULT/fit.ply --cameras SCENE/transforms_val.json -o RESULT/fit`
+writes OUT.jpg. RESULT/out was made with --eval-scene
+SCENE/transforms_val.json; RESULT/fit holds what `freerange render RESULT/fit.ply --cameras SCENE/transforms_val.json -o RESULT/fit`
 wrote of the baseline: `cargo run --release -p freerange --example baseline -- SCENE/transforms_full.json RESULT/fit.ply`.
 """
 import json
@@ -16,7 +17,6 @@ import sys
 from PIL import Image, ImageDraw, ImageFont
 
 INPUT, LARGE, GAP, FURTHER = 112, 168, 4, (0, 4, 8)
-VIEW = 2  # of FURTHER, in a comparison: from above, where print is
 
 
 def over_white(path, size):
@@ -50,8 +50,14 @@ def row(scene, result):
     return picture
 
 
+def median_view(result):
+    """The held-out view of median PSNR, so that nobody chooses."""
+    views = json.loads((result / "out" / "report.json").read_text())["samples"][0]["further_views"]["views"]
+    return sorted(range(len(views)), key=lambda i: views[i]["psnr"])[len(views) // 2]
+
+
 def compare(out, pairs):
-    """Rows of: four input photos, the baseline fit, the result, the ground truth; a held-out view, labeled."""
+    """Rows of: four input photos, the baseline fit, the result, the ground truth; the held-out view of median PSNR, labeled."""
     size, label = 2 * INPUT + GAP, 22
     titles = ("4 input photos", "3DGS-MCMC fit (128 px)", "free-range", "ground truth")
     sheet = Image.new("RGB", (4 * (size + 3 * GAP) - 3 * GAP, label + len(pairs) * (size + GAP)), (255, 255, 255))
@@ -62,7 +68,7 @@ def compare(out, pairs):
         top = label + row * (size + GAP)
         for i, file in enumerate(photos(scene, "transforms_full.json")[:4]):
             sheet.paste(over_white(file, INPUT), ((i % 2) * (INPUT + GAP), top + i // 2 * (INPUT + GAP)))
-        view = FURTHER[VIEW]
+        view = median_view(result)
         renders = (sorted((result / folder).glob("*.png"))[view] for folder in ("fit", "renders"))
         for column, file in enumerate((*renders, photos(scene, "transforms_val.json")[view]), 1):
             sheet.paste(over_white(file, size), (column * (size + 3 * GAP), top))
