@@ -1,20 +1,22 @@
 """Objects in rows: input photos, further photos, and renders of the result beneath them (docs/images/showcase.png).
 
-usage: showcase.py [--turning] OUT SCENE=RESULT [SCENE=RESULT ...]
+usage: showcase.py [--compare] OUT SCENE=RESULT [SCENE=RESULT ...]
 SCENE is a scene folder with transforms_full.json and transforms_val.json; RESULT holds what `freerange reconstruct
 SCENE/transforms_full.json -o RESULT/out` and `freerange render RESULT/out/gaussians.ply --cameras SCENE/transforms_val.json
 -o RESULT/renders` wrote. Needs Pillow. Writes OUT.png.
 
---turning: objects in columns instead, input photos above RESULT/out/turntable.gif (docs/images/turning.gif); writes OUT.gif.
+--compare: labeled columns instead: inputs, the baseline fit, the result, the ground truth (docs/images/comparison.jpg);
+writes OUT.jpg. RESULT/out was made with --eval-scene
+SCENE/transforms_val.json; RESULT/fit holds what `freerange render RESULT/fit.ply --cameras SCENE/transforms_val.json -o RESULT/fit`
+wrote of the baseline: `cargo run --release -p freerange --example baseline -- SCENE/transforms_full.json RESULT/fit.ply`.
 """
 import json
 import pathlib
 import sys
 
-from PIL import Image, ImageSequence
+from PIL import Image, ImageDraw, ImageFont
 
 INPUT, LARGE, GAP, FURTHER = 112, 168, 4, (0, 4, 8)
-SKIP, COLOURS = 2, 96  # every second frame of a turntable; colours of the GIF
 
 
 def over_white(path, size):
@@ -48,41 +50,38 @@ def row(scene, result):
     return picture
 
 
-def inputs(scene):
-    picture = Image.new("RGB", (2 * INPUT + GAP, 2 * INPUT + GAP), (255, 255, 255))
-    for i, file in enumerate(photos(scene, "transforms_full.json")[:4]):
-        picture.paste(over_white(file, INPUT), ((i % 2) * (INPUT + GAP), i // 2 * (INPUT + GAP)))
-    return picture
+def median_view(result):
+    """The held-out view of median PSNR, so that nobody chooses."""
+    views = json.loads((result / "out" / "report.json").read_text())["samples"][0]["further_views"]["views"]
+    return sorted(range(len(views)), key=lambda i: views[i]["psnr"])[len(views) // 2]
 
 
-def turning(out, pairs):
-    size = 2 * INPUT + GAP
-    still = [inputs(scene) for scene, _ in pairs]
-    turns = []
-    for _, result in pairs:
-        frames = ImageSequence.Iterator(Image.open(result / "out" / "turntable.gif"))
-        turns.append([f.convert("RGB").resize((size, size), Image.LANCZOS) for f in frames][::SKIP])
-    sheets = []
-    for now in zip(*turns, strict=True):
-        sheet = Image.new("RGB", (len(pairs) * (size + 4 * GAP) - 4 * GAP, 2 * size + GAP), (255, 255, 255))
-        for column, (photos_of_it, frame) in enumerate(zip(still, now, strict=True)):
-            left = column * (size + 4 * GAP)
-            sheet.paste(photos_of_it, (left, 0))
-            sheet.paste(frame, (left, size + GAP))
-        sheets.append(sheet)
-    # One palette for all frames, lest what stands still flickers.
-    palette = sheets[0].quantize(COLOURS)
-    frames = [sheet.quantize(palette=palette, dither=Image.Dither.NONE) for sheet in sheets]
-    frames[0].save(out + ".gif", save_all=True, append_images=frames[1:], loop=0, duration=40 * SKIP, optimize=True)
+def compare(out, pairs):
+    """Rows of: four input photos, the baseline fit, the result, the ground truth; the held-out view of median PSNR, labeled."""
+    size, label = 2 * INPUT + GAP, 22
+    titles = ("4 input photos", "3DGS-MCMC fit (128 px)", "free-range", "ground truth")
+    sheet = Image.new("RGB", (4 * (size + 3 * GAP) - 3 * GAP, label + len(pairs) * (size + GAP)), (255, 255, 255))
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=15)
+    for column, title in enumerate(titles):
+        draw.text((column * (size + 3 * GAP) + size // 2, 2), title, fill=(0, 0, 0), font=font, anchor="ma")
+    for row, (scene, result) in enumerate(pairs):
+        top = label + row * (size + GAP)
+        for i, file in enumerate(photos(scene, "transforms_full.json")[:4]):
+            sheet.paste(over_white(file, INPUT), ((i % 2) * (INPUT + GAP), top + i // 2 * (INPUT + GAP)))
+        view = median_view(result)
+        renders = (sorted((result / folder).glob("*.png"))[view] for folder in ("fit", "renders"))
+        for column, file in enumerate((*renders, photos(scene, "transforms_val.json")[view]), 1):
+            sheet.paste(over_white(file, size), (column * (size + 3 * GAP), top))
+    sheet.save(out + ".jpg", quality=88, optimize=True)
 
 
 def main():
     arguments = sys.argv[1:]
-    turn = arguments[0] == "--turning"
-    out, *rest = arguments[1:] if turn else arguments
+    labeled = arguments[0] == "--compare"
+    out, *rest = arguments[1:] if labeled else arguments
     pairs = [tuple(map(pathlib.Path, a.split("="))) for a in rest]
-    if turn:
-        turning(out, pairs)
+    if labeled:
+        compare(out, pairs)
         return
     rows = [row(*pair) for pair in pairs]
     sheet = Image.new("RGB", (rows[0].width, sum(r.height for r in rows) + 4 * GAP * (len(rows) - 1)), (255, 255, 255))

@@ -1,7 +1,7 @@
 //! A page on loopback that takes photos with cameras and shows how 3D Gaussians come of them.
 //!
 //! A [`Server`] has a queue of jobs, a folder for each, and an [`Engine`] that computes one after the other; it knows nothing of
-//! networks. `docs/serve.md` lists what it answers.
+//! networks. `docs/reference/http.md` lists what it answers.
 //!
 //! What clients send is bounded in bytes, pixels, files, jobs and time ([`Limits`]) before anything is decoded. Names of clients never
 //! become paths of ours: they name files below a job's own folder, after they were taken apart. `Host` and `Origin` are checked, so that
