@@ -12,8 +12,9 @@ use crate::error::CliError;
 pub struct Args {
     /// Folder or URL of shards.
     location: String,
-    /// Write a contact sheet of the first objects to this PNG file: two views, three slices, and the Gaussians before the
-    /// tree where they are kept.
+    /// Write a contact sheet of the first objects to this PNG file.
+    ///
+    /// It shows two views, three slices, and the full fit where it is stored.
     #[arg(long, value_name = "FILE")]
     sheet: Option<PathBuf>,
     /// Objects on the sheet.
