@@ -44,7 +44,8 @@ fn help(arg: &Arg) -> (String, Option<String>) {
 
 /// `-o, --output <OUTPUT>`
 fn spelled(arg: &Arg) -> String {
-    let values = arg.get_value_names().unwrap_or_default().iter().map(|v| format!("<{v}>")).collect::<Vec<_>>().join(" ");
+    let values =
+        arg.get_value_names().unwrap_or_default().iter().map(|v| format!("<{v}>")).collect::<Vec<_>>().join(" ");
     let takes = arg.get_action().takes_values();
     match (arg.get_short(), arg.get_long()) {
         (_, None) => values,
@@ -92,7 +93,10 @@ fn section(name: &str, command: &Command) -> String {
         out += &format!("{}\n\n", wrap(paragraph));
     }
     let usage = command.clone().render_usage().to_string();
-    out += &format!("```text\n{}\n```\n", usage.trim_start_matches("Usage: ").lines().map(str::trim).collect::<Vec<_>>().join("\n"));
+    out += &format!(
+        "```text\n{}\n```\n",
+        usage.trim_start_matches("Usage: ").lines().map(str::trim).collect::<Vec<_>>().join("\n")
+    );
     let mut groups: Vec<(String, String)> = Vec::new();
     for arg in arguments(command) {
         let plain = if arg.is_positional() { "Arguments" } else { "Options" };
@@ -105,7 +109,8 @@ fn section(name: &str, command: &Command) -> String {
     for (heading, rows) in groups {
         out += &format!("\n**{heading}**\n\n| option | | default |\n|---|---|---|\n{rows}");
     }
-    let subs: Vec<&Command> = command.get_subcommands().filter(|s| !s.is_hide_set() && s.get_name() != "help").collect();
+    let subs: Vec<&Command> =
+        command.get_subcommands().filter(|s| !s.is_hide_set() && s.get_name() != "help").collect();
     if !subs.is_empty() {
         out += "\n**Commands**\n\n| command | |\n|---|---|\n";
         for sub in subs {
@@ -138,8 +143,11 @@ fn the_reference_of_the_command_line_is_current() {
 fn help_is_short_and_in_the_words_of_the_field() {
     let mut wrong = Vec::new();
     for (name, command) in all() {
-        let mut texts: Vec<(String, String)> =
-            [command.get_about(), command.get_long_about()].into_iter().flatten().map(|t| (name.clone(), t.to_string())).collect();
+        let mut texts: Vec<(String, String)> = [command.get_about(), command.get_long_about()]
+            .into_iter()
+            .flatten()
+            .map(|t| (name.clone(), t.to_string()))
+            .collect();
         for arg in arguments(&command) {
             let place = format!("{name} {}", spelled(arg));
             texts.push((place.clone(), help(arg).0));
@@ -235,16 +243,33 @@ trait FilterHelp {
 impl FilterHelp for Result<(), clap::Error> {
     /// Help and version are no mistakes.
     fn filter_help(self) -> Self {
-        self.or_else(|e| if matches!(e.kind(), ErrorKind::DisplayHelp | ErrorKind::DisplayVersion) { Ok(()) } else { Err(e) })
+        self.or_else(|e| {
+            if matches!(e.kind(), ErrorKind::DisplayHelp | ErrorKind::DisplayVersion) { Ok(()) } else { Err(e) }
+        })
     }
 }
 
 /// Options of other programs that the documents name.
 const OTHERS: &[&str] = &[
     // cargo
-    "--release", "--features", "--no-default-features", "--config", "--workspace", "--locked", "--path", "--git", "--ignored",
+    "--release",
+    "--features",
+    "--no-default-features",
+    "--config",
+    "--workspace",
+    "--locked",
+    "--path",
+    "--git",
+    "--ignored",
     // git, docker, MPI, COLMAP, pip
-    "--depth", "--rm", "--gpus", "--bind-to", "--mpi", "--ntasks-per-node", "--array", "--upgrade",
+    "--depth",
+    "--rm",
+    "--gpus",
+    "--bind-to",
+    "--mpi",
+    "--ntasks-per-node",
+    "--array",
+    "--upgrade",
 ];
 
 #[test]
@@ -260,7 +285,10 @@ fn every_option_that_the_documents_name_exists() {
         for (number, line) in page.lines() {
             for span in line.split('`').skip(1).step_by(2) {
                 let ours = span.starts_with("--") || span.starts_with("freerange ");
-                for word in span.split(|c: char| c.is_whitespace() || "=,/[]".contains(c)).filter(|w| ours && w.starts_with("--") && w.len() > 2) {
+                for word in span
+                    .split(|c: char| c.is_whitespace() || "=,/[]".contains(c))
+                    .filter(|w| ours && w.starts_with("--") && w.len() > 2)
+                {
                     if !options.contains_key(word) && !OTHERS.contains(&word) {
                         wrong.push(format!("{}:{number}: {word}", page.name));
                     }
@@ -274,7 +302,10 @@ fn every_option_that_the_documents_name_exists() {
 #[test]
 fn lines_of_a_shell_are_understood() {
     assert_eq!(shell_words("a 'b c' \"d\" # e"), ["a", "b c", "d"]);
-    assert_eq!(calls("mpirun -n 2 freerange train a.toml && freerange eval | head"), [vec!["train", "a.toml"], vec!["eval"]]);
+    assert_eq!(
+        calls("mpirun -n 2 freerange train a.toml && freerange eval | head"),
+        [vec!["train", "a.toml"], vec!["eval"]]
+    );
     assert_eq!(calls("X=1 target/release/freerange devices > file"), [vec!["devices"]]);
     assert!(calls("docker run freerange reconstruct").is_empty() && calls("cargo install freerange").is_empty());
 }

@@ -101,7 +101,8 @@ fn sources_name_pages_that_exist() {
 
 #[test]
 fn paths_in_blocks_exist() {
-    let folders = ["apps/", "checkpoints/", "configs/", "crates/", "docs/", "examples/", "fuzz/", "python/", "tests/", "tools/"];
+    let folders =
+        ["apps/", "checkpoints/", "configs/", "crates/", "docs/", "examples/", "fuzz/", "python/", "tests/", "tools/"];
     let mut wrong = Vec::new();
     for page in pages().into_iter().filter(Page::is_current) {
         for block in page.blocks() {

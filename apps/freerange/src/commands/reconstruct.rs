@@ -247,7 +247,9 @@ fn run_in(args: &Args, job: &Job) -> Result<(), CliError> {
         return batch::run(args, job);
     }
     if args.overwrite {
-        return Err(CliError::input("--overwrite: expected several scenes, found one, which is always reconstructed again"));
+        return Err(CliError::input(
+            "--overwrite: expected several scenes, found one, which is always reconstructed again",
+        ));
     }
     let begin = Instant::now();
     let path = &args.scene[0];

@@ -11,8 +11,7 @@ use syn::{Attribute, Expr, Fields, GenericArgument, Item, ItemEnum, ItemStruct, 
 use super::pages::{cell, files, wrap};
 
 /// The smallest training configuration: what it leaves out has its default.
-const SMALLEST: &str =
-    "[model]\n[data]\n[refiner]\n[[stage]]\ndepth = 10\nimage_size = 504\nbatch = 1\nsteps = 1\n";
+const SMALLEST: &str = "[model]\n[data]\n[refiner]\n[[stage]]\ndepth = 10\nimage_size = 504\nbatch = 1\nsteps = 1\n";
 
 /// A type that configurations are made of, and the folder of its crate.
 struct Known {
@@ -261,9 +260,12 @@ impl Writer<'_> {
                     }
                     "see below".to_owned()
                 }
-                Some(Item::Enum(item)) => {
-                    item.variants.iter().map(|v| format!("`\"{}\"`", variant_name(item, v))).collect::<Vec<_>>().join(", ")
-                }
+                Some(Item::Enum(item)) => item
+                    .variants
+                    .iter()
+                    .map(|v| format!("`\"{}\"`", variant_name(item, v)))
+                    .collect::<Vec<_>>()
+                    .join(", "),
                 _ => format!("{}{}", if many { "list of: " } else { "" }, kind(ty)),
             };
             let default = match (&value, optional || all_default || serde.contains("default")) {

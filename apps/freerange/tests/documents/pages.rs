@@ -36,7 +36,8 @@ pub fn files(extensions: &[&str]) -> Vec<Page> {
         for entry in fs::read_dir(folder).unwrap() {
             let path = entry.unwrap().path();
             let name = path.file_name().unwrap().to_string_lossy().into_owned();
-            let left = name.starts_with('.') && name != ".github" && name != ".ci" || name == "node_modules" || name == "venv";
+            let left =
+                name.starts_with('.') && name != ".github" && name != ".ci" || name == "node_modules" || name == "venv";
             if left {
                 continue;
             }
@@ -67,8 +68,16 @@ impl Page {
     /// Pages for users, whose language is held to the rules of CONTRIBUTING.md. Research notes and reports are not.
     pub fn is_for_users(&self) -> bool {
         let folders = ["docs/guides/", "docs/concepts/", "docs/reference/", "docs/training/"];
-        let pages = ["README.md", "docs/README.md", "docs/limits.md", "docs/troubleshooting.md", "docs/install.md", "python/README.md"];
-        (folders.iter().any(|f| self.name.starts_with(f)) || pages.contains(&self.name.as_str())) && !GENERATED.contains(&self.name.as_str())
+        let pages = [
+            "README.md",
+            "docs/README.md",
+            "docs/limits.md",
+            "docs/troubleshooting.md",
+            "docs/install.md",
+            "python/README.md",
+        ];
+        (folders.iter().any(|f| self.name.starts_with(f)) || pages.contains(&self.name.as_str()))
+            && !GENERATED.contains(&self.name.as_str())
     }
 
     /// Pages whose commands are those of today's program: all but reports, research notes and the history.
@@ -97,7 +106,9 @@ impl Page {
         let mut fenced = false;
         for (i, line) in self.text.lines().enumerate() {
             match line.trim_start().strip_prefix("```") {
-                Some(info) if !fenced => found.push(Block { info: info.trim().into(), line: i + 2, text: String::new() }),
+                Some(info) if !fenced => {
+                    found.push(Block { info: info.trim().into(), line: i + 2, text: String::new() })
+                }
                 Some(_) => {}
                 None if fenced => found.last_mut().unwrap().text += &format!("{line}\n"),
                 None => {}
