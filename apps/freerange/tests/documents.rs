@@ -86,12 +86,17 @@ fn mentioned_pages(text: &str) -> BTreeSet<String> {
     words.filter(|w| w.starts_with("docs/") && w.ends_with(".md")).map(str::to_owned).collect()
 }
 
+/// Pages that a script writes in the course of time.
+const LATER: [&str; 1] = ["docs/results/paper-tables/tables.md"];
+
 #[test]
 fn sources_name_pages_that_exist() {
     let sources = files(&["rs", "toml", "py", "sh", "mjs", "js", "yaml", "yml", "ipynb"]);
     let mut wrong = Vec::new();
     for source in sources.iter().filter(|s| s.name != "apps/freerange/tests/documents.rs") {
-        let missing = mentioned_pages(&source.text).into_iter().filter(|page| !root().join(page).exists());
+        let missing = mentioned_pages(&source.text)
+            .into_iter()
+            .filter(|page| !LATER.contains(&page.as_str()) && !root().join(page).exists());
         wrong.extend(missing.map(|page| format!("{}: {page}", source.name)));
     }
     assert!(wrong.is_empty(), "pages that sources name and that are not there:\n{}", wrong.join("\n"));
@@ -101,8 +106,7 @@ fn sources_name_pages_that_exist() {
 
 #[test]
 fn paths_in_blocks_exist() {
-    let folders =
-        ["apps/", "checkpoints/", "configs/", "crates/", "docs/", "examples/", "fuzz/", "python/", "tests/", "tools/"];
+    let folders = ["apps/", "checkpoints/", "configs/", "crates/", "docs/", "examples/", "python/", "tests/", "tools/"];
     let mut wrong = Vec::new();
     for page in pages().into_iter().filter(Page::is_current) {
         for block in page.blocks() {
@@ -172,7 +176,7 @@ fn sentences_are_short() {
         let lengths: Vec<usize> = all.iter().map(|(_, s)| words(s)).filter(|n| *n > 0).collect();
         let total: usize = lengths.iter().sum();
         let mean = total as f64 / lengths.len().max(1) as f64;
-        let held = page.is_for_users();
+        let held = page.is_plain();
         let mark = if held { "" } else { " (not held)" };
         println!("{total:5} {mean:4.1} {:4}  {}{mark}", lengths.iter().max().unwrap_or(&0), page.name);
         if held && mean > 20.0 {
@@ -188,7 +192,7 @@ fn sentences_are_short() {
 #[test]
 fn lines_of_prose_are_at_most_100_columns() {
     let mut wrong = Vec::new();
-    for page in pages().into_iter().filter(Page::is_for_users) {
+    for page in pages().into_iter().filter(Page::is_plain) {
         for (number, line) in page.lines() {
             let text = line.trim();
             // Tables cannot be wrapped; neither can a single long link.
@@ -205,7 +209,7 @@ fn lines_of_prose_are_at_most_100_columns() {
 #[test]
 fn pages_use_the_words_of_the_field() {
     let mut wrong = Vec::new();
-    for page in pages().into_iter().filter(|p| p.is_for_users() || pages::GENERATED.contains(&p.name.as_str())) {
+    for page in pages().into_iter().filter(|p| p.is_plain() || pages::GENERATED.contains(&p.name.as_str())) {
         for (number, line) in page.lines() {
             wrong.extend(retired(&pages::plain(line)).into_iter().map(|w| format!("{}:{number}: {w}", page.name)));
         }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use freerange::{Choices, Device, Reconstructor};
+use freerange::{Choices, DeviceName, Reconstructor};
 use freerange_build::MakingConfig;
 use freerange_flow::config::TrainConfig;
 use serde_json::Value;
@@ -365,7 +365,7 @@ pub fn page() -> String {
          Keys of `--set KEY=VALUE` (`reconstruct`, `serve`, `eval`), and of `pipeline` in `report.json`. Defaults are\n\
          those of the built-in model with `--quality default`.\n\n| key | default | |\n|---|---|---|\n",
     );
-    let model = Reconstructor::shipped(&Device::cpu()).unwrap();
+    let model = Reconstructor::shipped(&DeviceName::Cpu.open().unwrap()).unwrap();
     let pipeline = model.options_of(&Choices::default()).unwrap().pipeline;
     let mut fields = Vec::new();
     leaves(&serde_json::to_value(&pipeline).unwrap(), "", &mut fields);

@@ -65,22 +65,13 @@ pub fn pages() -> Vec<Page> {
 pub const GENERATED: [&str; 2] = ["docs/reference/cli.md", "docs/reference/config.md"];
 
 impl Page {
-    /// Pages for users, whose language is held to the rules of CONTRIBUTING.md. Research notes and reports are not.
-    pub fn is_for_users(&self) -> bool {
-        let folders = ["docs/guides/", "docs/concepts/", "docs/reference/", "docs/training/"];
-        let pages = [
-            "README.md",
-            "docs/README.md",
-            "docs/limits.md",
-            "docs/troubleshooting.md",
-            "docs/install.md",
-            "python/README.md",
-        ];
-        (folders.iter().any(|f| self.name.starts_with(f)) || pages.contains(&self.name.as_str()))
-            && !GENERATED.contains(&self.name.as_str())
+    /// Pages whose language is held to the rules of CONTRIBUTING.md: the current ones that people write, but for the plan,
+    /// which changes every day.
+    pub fn is_plain(&self) -> bool {
+        self.is_current() && self.name != "docs/status.md" && !GENERATED.contains(&self.name.as_str())
     }
 
-    /// Pages whose commands are those of today's program: all but reports, research notes and the history.
+    /// Pages about today's program: all but reports, research notes and the history.
     pub fn is_current(&self) -> bool {
         let past = ["docs/research/", "docs/evaluation/", "docs/results/", "CHANGELOG.md"];
         !past.iter().any(|p| self.name.starts_with(p))
@@ -122,22 +113,22 @@ impl Page {
     /// Paragraphs and items of lists: number of the first line, and text in one line. Neither headings nor tables nor HTML.
     pub fn paragraphs(&self) -> Vec<(usize, String)> {
         let mut found: Vec<(usize, String)> = Vec::new();
-        let mut last = usize::MAX;
+        let mut last = None;
         for (number, line) in self.lines() {
             let text = line.trim();
             if text.is_empty() || ["#", "|", "<", "!["].iter().any(|p| text.starts_with(p)) {
-                last = usize::MAX;
+                last = None;
                 continue;
             }
             let item = item_text(text);
             match found.last_mut() {
-                Some((_, paragraph)) if item.is_none() && last + 1 == number => {
+                Some((_, paragraph)) if item.is_none() && last == Some(number - 1) => {
                     paragraph.push(' ');
                     paragraph.push_str(text);
                 }
                 _ => found.push((number, item.unwrap_or(text).into())),
             }
-            last = number;
+            last = Some(number);
         }
         found
     }
