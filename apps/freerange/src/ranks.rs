@@ -268,7 +268,7 @@ fn connect(launched: &Launched) -> Result<Option<Rc<dyn Ranks>>, CliError> {
     if !launched.mpi {
         return Err(CliError::input(format!(
             "{} started {} processes without MPI: expected `srun --mpi=pmix` or `--mpi=pmi2`, as the MPI library was built \
-             (`srun --mpi=list` tells what there is)",
+             (`srun --mpi=list` lists them)",
             launched.by,
             launched.world.unwrap_or(0)
         )));

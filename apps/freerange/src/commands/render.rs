@@ -65,6 +65,6 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     }
     bar.finish();
     output.commit()?;
-    println!("{} pictures in {}", cameras.len(), args.output.display());
+    println!("{} images in {}", cameras.len(), args.output.display());
     Ok(())
 }

@@ -253,26 +253,18 @@ impl Writer<'_> {
                     inner.push((full, many, ty_name, place.into(), if many { Value::Null } else { value }));
                     continue;
                 }
-                Some(Item::Enum(item)) if item.variants.iter().any(|v| !matches!(v.fields, Fields::Unit)) => {
-                    if setting(&serde_of(&item.attrs), "tag").is_some() {
-                        inner.push((full, many, ty_name, place.into(), value));
-                        continue;
-                    }
-                    "see below".to_owned()
+                Some(Item::Enum(item)) if setting(&serde_of(&item.attrs), "tag").is_some() => {
+                    inner.push((full, many, ty_name, place.into(), value));
+                    continue;
                 }
-                Some(Item::Enum(item)) => item
-                    .variants
-                    .iter()
-                    .map(|v| format!("`\"{}\"`", variant_name(item, v)))
-                    .collect::<Vec<_>>()
-                    .join(", "),
+                Some(Item::Enum(_)) => "one of".to_owned(),
                 _ => format!("{}{}", if many { "list of: " } else { "" }, kind(ty)),
             };
-            let default = match (&value, optional || all_default || serde.contains("default")) {
-                (Value::Null, false) => "required".into(),
-                (Value::Null, true) => String::new(),
-                (value, true) => format!("`{}`", shown(value)),
-                (_, false) => "required".into(),
+            let may_be_left_out = optional || all_default || serde.contains("default");
+            let default = match &value {
+                Value::Null if may_be_left_out => String::new(),
+                Value::Null => "required".into(),
+                value => format!("`{}`", shown(value)),
             };
             let mut about = docs(&field.attrs);
             if let Some(Item::Enum(item)) = known.map(|k| &k.item) {
