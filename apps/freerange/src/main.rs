@@ -7,6 +7,8 @@ mod photos;
 mod pipeline;
 mod progress;
 mod ranks;
+#[cfg(test)]
+mod reference;
 mod runtime;
 mod signals;
 
@@ -18,8 +20,8 @@ use signals::{EXIT_CODE, Signals};
 
 /// Posed photos in, 3D Gaussians out.
 ///
-/// From as few as four posed images of an object, a diffusion transformer predicts a compact, complete set of 3D
-/// Gaussians by flow matching. Exit codes: 0 done, 1 failed, 2 bad input.
+/// Reconstructs one object from as few as four photos with cameras: initial fits, a network that refines them, and an
+/// optimization on the photos. Exit codes: 0 done, 1 failed, 2 bad input.
 #[derive(Parser)]
 #[command(name = "freerange", version, max_term_width = 100)]
 struct Cli {
@@ -34,35 +36,35 @@ struct Cli {
 enum Command {
     /// Reconstruct an object from posed images.
     Reconstruct(Box<commands::reconstruct::Args>),
-    /// Show what is understood of a scene: cameras, masks, place and size, and what may go wrong.
+    /// Check a scene before reconstruction: cameras, masks, place, size and warnings.
     Inspect(commands::inspect::Args),
     /// Find the cameras of photos that have none.
     Poses(commands::poses::Args),
-    /// Serve a page: drop photos with cameras, mend masks, and watch the Gaussians appear.
+    /// Serve a web page: drop photos with cameras, correct masks, watch the Gaussians appear.
     Serve(Box<commands::serve::Args>),
     /// Render Gaussians from given cameras.
     Render(commands::render::Args),
-    /// Convert Gaussians between file formats, or into a page that shows them.
+    /// Convert Gaussians between file formats, into a mesh, or into a page that shows them.
     Convert(commands::convert::Args),
     /// Measure a method on objects with validation views; compare reports; ablations.
     ///
-    /// Images are compared over white at their own resolution. Writes report.html, report.md and report.json into the output
-    /// folder, and what is known of each object into its folder `objects`. Run the same command again to go on where it was
-    /// stopped. Exit code 1 if an object failed; the others are measured all the same.
+    /// Images are compared on white at their own resolution. Writes report.html, report.md, report.json and a record of each
+    /// object. Run the same command again to continue a stopped run. If an object fails, the others go on and the exit
+    /// code is 1.
     Eval(Box<commands::eval::Args>),
     /// List and download the published weights of metrics.
     #[command(subcommand)]
     Weights(commands::weights::Command),
     /// Train a model.
     Train(commands::train::Args),
-    /// Make and look at training data.
+    /// Build and inspect training data.
     #[command(subcommand)]
     Data(commands::data::Command),
-    /// Measure speed on a device.
+    /// Benchmark kernels and whole steps on a device.
     Bench(commands::bench::Args),
     /// List the devices that this program can compute on.
     Devices(commands::devices::Args),
-    /// Look at models.
+    /// Inspect, shrink, average and export models.
     #[command(subcommand)]
     Model(commands::model::Command),
 }

@@ -20,12 +20,13 @@ use crate::error::CliError;
 #[derive(clap::Args)]
 #[command(next_help_heading = "Photos and cameras")]
 pub struct Photos {
-    /// Whose cameras to read where a folder has several: transforms, colmap, polycam, metashape, realitycapture or opf.
+    /// Format of the cameras, if a folder has several: transforms, colmap, polycam, metashape, realitycapture or opf.
     #[arg(long, value_name = "FORMAT", value_parser = parse_format, hide_short_help = true)]
     cameras: Option<Format>,
-    /// The photos have no cameras: they were taken at even steps of one full turn of the object, in order of their names, from this
-    /// elevation and with this field of view across the longer side, in degrees. The object turns counterclockwise as seen from above;
-    /// add `,cw` for the other way.
+    /// Photos without cameras, of one full turn of a turntable: elevation and field of view in degrees.
+    ///
+    /// The photos are at even steps, in the order of their names. The field of view is across the longer side. The object turns
+    /// counterclockwise as seen from above; add `,cw` for clockwise.
     #[arg(
         long,
         value_name = "ELEVATION,FOV",
@@ -34,31 +35,33 @@ pub struct Photos {
         hide_short_help = true
     )]
     turntable: Option<Turntable>,
-    /// The folder of the photos, where they lie apart from the cameras (COLMAP, Polycam, Metashape, RealityCapture, OPF).
+    /// Folder of the photos, if they are not beside the cameras.
     #[arg(long, value_name = "FOLDER", hide_short_help = true)]
     images: Option<PathBuf>,
-    /// Where masks come from: a folder, alpha, plain (one color behind the object) or estimate [default: what is there].
+    /// Source of masks: a folder, alpha, plain (one background color) or estimate [default: auto].
     ///
-    /// A folder holds NAME.png, white is the object; without the option folders called masks are taken. estimate: from poses and colors.
+    /// A folder has NAME.png, the object in white. auto takes mask files, then alpha, then a plain background, then an estimate from
+    /// poses and colors.
     #[arg(long, value_name = "WHERE", value_parser = parse_masks)]
     masks: Option<MaskSource>,
-    /// Masks from a segmentation network, an ONNX file such as u2netp.onnx: one input (1 x 3 x height x width), the first output is the
-    /// mask. Needs a program built with --features mask-model.
+    /// Masks from a segmentation network, an ONNX file such as u2netp.onnx.
+    ///
+    /// It has one input (1 x 3 x height x width); its first output is the mask. Needs a build with --features mask-model.
     #[arg(long, value_name = "FILE", conflicts_with = "masks", hide_short_help = true, hide = !cfg!(feature = "mask-model"))]
     mask_model: Option<PathBuf>,
-    /// What the network takes for pixels: imagenet (mean and deviation), unit (0 to 1), centered (-0.5 to 0.5), signed (-1 to 1).
+    /// Pixel values of the mask network: imagenet (normalized), unit (0 to 1), centered (-0.5 to 0.5), signed (-1 to 1).
     #[arg(long, value_name = "RANGE", default_value = "imagenet", requires = "mask_model", value_parser = parse_range, hide_short_help = true, hide = !cfg!(feature = "mask-model"))]
     mask_model_pixels: PixelRange,
-    /// In mask files black is the object.
+    /// The object is black in mask files.
     #[arg(long, hide_short_help = true)]
     invert_masks: bool,
-    /// Longest side, in pixels, that photos are used at; larger ones are made smaller.
+    /// Longest side of the photos; larger ones are shrunk.
     #[arg(long, value_name = "PIXELS", default_value_t = 1024, value_parser = clap::value_parser!(u32).range(64..=16384), hide_short_help = true)]
     max_resolution: u32,
-    /// The object's middle in the scene's frame [default: found from masks and cameras].
+    /// Center of the object in the scene's frame [default: from masks and cameras].
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true, hide_short_help = true)]
     center: Option<DVec3>,
-    /// The radius of a sphere about its middle that holds the object [default: found].
+    /// Radius of a sphere about the center that holds the object [default: from masks and cameras].
     #[arg(long, value_name = "R", hide_short_help = true)]
     radius: Option<f64>,
 }

@@ -22,22 +22,23 @@ pub struct PipelineArgs {
     pub quality: QualityName,
     /// Optimization steps on the photos; 0 returns the network's Gaussians [default: of the preset, 500].
     ///
-    /// For up to four photos. More photos get as many steps each, up to sixteen.
+    /// For up to four photos. With five to sixteen photos the number grows in proportion.
     #[arg(long, value_name = "STEPS")]
     pub iterations: Option<usize>,
-    /// Whether mirror planes and axes of revolution are looked for [default: auto; off in draft].
+    /// Detect mirror planes and axes of revolution [default: auto; off in draft].
     ///
-    /// With up to four photos. A mirror plane that the photos agree with makes each photo two, an axis adds rotated silhouettes.
+    /// With up to four photos. A plane adds mirrored photos, an axis adds rotated silhouettes, where the photos agree.
     #[arg(long, value_enum)]
     pub symmetry: Option<SymmetryName>,
-    /// Begin with initial fits, with samples of the flow from noise (the paper's method), or with a file of Gaussians in the
-    /// cameras' frame [default: fit].
+    /// Begin with initial fits, flow samples from noise (the paper), or a file of Gaussians [default: fit].
+    ///
+    /// A file is in the cameras' frame.
     #[arg(long, value_name = "fit|flow|FILE")]
     pub init: Option<InitChoice>,
     /// Set a field of the pipeline, such as propose.count=2; an unknown KEY lists all.
     #[arg(long, value_name = "KEY=VALUE", value_parser = assignment)]
     pub set: Vec<(String, String)>,
-    /// Most photos that the network sees, chosen from all around the object [default: the checkpoint's, 6 for the shipped one].
+    /// Most photos that the network sees, spread around the object [default: 6, or the checkpoint's].
     ///
     /// The optimization sees all photos.
     #[arg(long, value_name = "K", value_parser = clap::value_parser!(u16).range(1..=256), hide_short_help = true)]
@@ -45,13 +46,14 @@ pub struct PipelineArgs {
     /// Seed of the (first) sample.
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
-    /// Model to use: a file, or hf:OWNER/NAME[@REVISION] [default: the shipped one].
+    /// Model: a file, or hf:OWNER/NAME[@REVISION] [default: the built-in one].
     ///
-    /// What a revision of a model on the Hugging Face hub meant when it was first used is kept in the cache.
+    /// The cache keeps the commit that a revision on the Hugging Face hub had at its first use.
     #[arg(long, value_name = "FILE", help_heading = "Model and device")]
     pub checkpoint: Option<PathBuf>,
-    /// Folder of the weights (config.json, model.safetensors) of the checkpoint's frozen encoder, if it has one [default: where
-    /// it was in training, or where `freerange weights fetch` puts it].
+    /// Weights of the checkpoint's frozen encoder: a folder with config.json and model.safetensors.
+    ///
+    /// Without it: the folder used in training, then that of `freerange weights fetch`. The built-in model needs none.
     #[arg(
         long,
         value_name = "FOLDER",
@@ -60,16 +62,15 @@ pub struct PipelineArgs {
         help_heading = "Model and device"
     )]
     pub encoder_weights: Option<PathBuf>,
-    /// Arithmetic of the network: f32, bf16 or f16 where the device has it, or auto, the faster of the first two [default: the
-    /// checkpoint's].
+    /// Precision of the network: f32, bf16, f16, or auto for the faster of the first two [default: f32, or the checkpoint's].
     #[arg(long, value_parser = parse_precision, hide_short_help = true, help_heading = "Model and device")]
     pub precision: Option<Compute>,
-    /// Where to compute: auto, cpu, cuda, metal, vulkan or webgpu, with a number as in cuda:1.
+    /// Device: auto, cpu, cuda, metal, vulkan or webgpu, with a number as in cuda:1.
     #[arg(long, default_value = "auto", help_heading = "Model and device")]
     pub device: DeviceName,
-    /// Which way is up: auto, z, y, cameras (where the tops of the photos point), or a direction X,Y,Z.
+    /// Up axis of the scene: auto, z, y, cameras (tops of the photos), or a direction X,Y,Z.
     ///
-    /// auto: +z where the cameras' format has it so, else by what the object stands on, or by the cameras.
+    /// auto: +z where the format of the cameras defines it. Otherwise the table below the object, or the cameras.
     #[arg(long, default_value = "auto", allow_hyphen_values = true, help_heading = "Photos and cameras")]
     pub up: UpChoice,
 }
@@ -79,9 +80,9 @@ pub struct PipelineArgs {
 pub enum QualityName {
     /// One proposal, no symmetry, 150 steps at 256 pixels.
     Draft,
-    /// What results are reported for.
+    /// The setting of all reported results.
     Default,
-    /// Twice the steps.
+    /// Twice the optimization steps.
     High,
 }
 

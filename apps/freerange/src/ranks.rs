@@ -21,11 +21,10 @@ pub struct Job {
 /// How tensors of gradients are summed over ranks.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum Sums {
-    /// Through the host's memory and MPI, whatever the device.
+    /// Through host memory and MPI, on any device.
     #[default]
     Host,
-    /// From card to card through NCCL; all else through MPI. Experimental: no card has run it yet. Needs a build with
-    /// `--features nccl`.
+    /// From card to card by NCCL. Experimental: no card has run it. Needs a build with `--features nccl`.
     Nccl,
 }
 
@@ -269,7 +268,7 @@ fn connect(launched: &Launched) -> Result<Option<Rc<dyn Ranks>>, CliError> {
     if !launched.mpi {
         return Err(CliError::input(format!(
             "{} started {} processes without MPI: expected `srun --mpi=pmix` or `--mpi=pmi2`, as the MPI library was built \
-             (`srun --mpi=list` tells what there is)",
+             (`srun --mpi=list` lists them)",
             launched.by,
             launched.world.unwrap_or(0)
         )));

@@ -18,20 +18,20 @@ pub struct ShardConfig {
     pub objects_per_shard: u64,
     /// Format of the views.
     pub images: ImageFormat,
-    /// Whether the Gaussians before the tree are stored, too: other depths can then be had without another fit.
+    /// Whether the full fit is stored, too. Slices at other depths then need no other fit.
     pub leaves: bool,
     /// Views per object, from cameras of their own, that Gaussians are measured against and that are not stored. 0
     /// measures nothing.
     pub held_out: usize,
-    /// Objects whose Gaussians before the tree have less PSNR than this, in dB, are flagged: they stay in the shard, but
-    /// count neither for the statistics nor for training.
+    /// Objects whose full fit has less PSNR than this, in dB, are flagged: they stay in the shard, but statistics and training
+    /// leave them out.
     pub min_psnr: f64,
-    /// Share of objects for validation. Which ones follows from their ids.
+    /// Fraction of objects for validation, chosen by their ids.
     pub validation: f64,
-    /// Share of objects for testing.
+    /// Fraction of objects for testing.
     pub test: f64,
-    /// The views that evaluation gives to a model, and those that it scores. Its seed is replaced by the object's.
-    /// Objects with fewer than `2 inputs + validation` views get no such sets.
+    /// View sets for evaluation: inputs and validation views. Its seed is replaced by the object's. Objects with fewer than
+    /// `2 inputs + validation` views get none.
     pub selection: SelectionConfig,
 }
 
@@ -119,7 +119,7 @@ pub struct MakingConfig {
     pub object: ObjectConfig,
     /// What shards keep of each object, and how objects are divided.
     pub shard: ShardConfig,
-    /// What objects in shards have that there is no time for on the fly.
+    /// Values of `object` that are different for objects in shards.
     pub build: BuildOverrides,
     /// Depths of the slices in shards, ascending; empty: those of training.
     pub depths: Vec<u32>,
@@ -133,9 +133,9 @@ pub struct MakingConfig {
 pub struct BuildOverrides {
     /// Views per object.
     pub views: Option<usize>,
-    /// Gradient steps that adapt each slice to the views.
+    /// Optimization steps on each slice.
     pub polish: Option<usize>,
-    /// Quick fits of some of the views per object.
+    /// Initial fits of a few views per object.
     pub input_fits: Option<usize>,
 }
 

@@ -34,19 +34,19 @@ pub enum GaussianSource {
 pub struct ObjectConfig {
     /// Where the Gaussians come from.
     pub gaussians: GaussianSource,
-    /// The `surface` way.
+    /// Settings of `surface`.
     pub surface: SurfaceConfig,
-    /// The `fit` way. Its seed is replaced by one drawn for the object.
+    /// Settings of `fit`. Its seed is replaced by one drawn for the object.
     pub fit: FitConfig,
-    /// Gradient steps that adapt each slice of the tree to the views. 0: slices are what the tree says.
+    /// Optimization steps on each slice of the tree. 0: the tree's own slices.
     pub polish: usize,
-    /// Quick fits of some of the views, each of a set of its own, as sampling starts from: see [`InputFit`](freerange_data::InputFit).
+    /// Initial fits of a few views, each of another set of views: see [`InputFit`](freerange_data::InputFit).
     pub input_fits: usize,
-    /// How these are made.
+    /// Settings of these initial fits.
     pub quick_fit: QuickFitConfig,
-    /// Gradient steps towards all views that mend each.
+    /// Optimization steps on all views that make the refined target of each initial fit.
     pub mend: usize,
-    /// How the axes of the Gaussians in the tree are labelled.
+    /// How the axes of the Gaussians in the tree are labeled.
     pub alignment: Alignment,
     /// Rendered views per object.
     pub views: usize,

@@ -4,7 +4,7 @@ use rand::Rng;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Background {
-    /// Another uniformly drawn colour every time: nothing can hide against all of them, so that the opacity has to agree
+    /// Another uniformly drawn color every time: nothing can hide against all of them, so that the opacity has to agree
     /// with the views' alpha.
     #[default]
     Random,
@@ -15,7 +15,7 @@ pub enum Background {
 }
 
 impl Background {
-    /// The colour, drawn from `rng` if need be; linear or encoded is the caller's choice.
+    /// The color, drawn from `rng` if need be; linear or encoded is the caller's choice.
     pub fn draw(self, rng: &mut impl Rng) -> [f32; 3] {
         match self {
             Self::Random => rng.random(),

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Rates {
-    /// Centres, in world units.
+    /// Centers, in world units.
     pub mean: f64,
     /// Logarithms of the standard deviations.
     pub scale: f64,
@@ -16,24 +16,24 @@ pub struct Rates {
     pub rotation: f64,
     /// Logit of the opacity.
     pub opacity: f64,
-    /// Colour, sRGB-encoded 0..1.
+    /// Color, sRGB-encoded 0..1.
     pub color: f64,
 }
 
 /// Settings of [`fit`](crate::fit). The defaults suit objects in the canonical frame (a sphere of radius 0.5 about
-/// the origin) and 3DGS-MCMC's published values where those do not depend on the size of the world.
+/// the origin). They are 3DGS-MCMC's published values where those do not depend on the size of the world.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct FitConfig {
-    /// Optimisation steps.
+    /// Optimization steps.
     pub iterations: usize,
     /// Number of Gaussians never exceeded, and reached if there are enough growth steps.
     pub cap_max: usize,
     /// Number of Gaussians to start with, where no cloud is given; at most `cap_max`.
     pub initial: usize,
-    /// Opacity of these, 0..1. (The data engine's fits, which start from points on a surface, take it, too.)
+    /// Their opacity at the start, 0..1. Fits that start from points on a surface take it, too.
     pub initial_opacity: f64,
-    /// Standard deviation of these, as a multiple of the distance to their three nearest neighbours.
+    /// Their standard deviation at the start, in multiples of the distance to the three nearest neighbors.
     pub initial_scale: f64,
     /// Radius of the sphere around the origin that holds the object. World units.
     pub radius: f64,
@@ -47,7 +47,7 @@ pub struct FitConfig {
     pub growth: f64,
     /// Learning rates at the start.
     pub rates: Rates,
-    /// What the learning rate of the centres has become at the end, exponentially. The others stay as they are.
+    /// Learning rate of the centers at the end, reached exponentially. The others are constant.
     pub final_mean_rate: f64,
     /// Weight of 1 - SSIM; that of L1 is the rest. 0..1
     pub lambda_ssim: f64,
@@ -55,12 +55,11 @@ pub struct FitConfig {
     pub opacity_regularizer: f64,
     /// Weight of the mean standard deviation in the loss.
     pub scale_regularizer: f64,
-    /// Strength of the noise that moves faint Gaussians, as a multiple of the centres' current learning rate.
+    /// Strength of the noise that moves faint Gaussians, in multiples of the centers' current learning rate.
     pub noise_lr: f64,
-    /// Gaussians of at most this opacity are dead, and put where others are. 0..1
+    /// Gaussians of at most this opacity are dead and are relocated. 0..1
     pub dead_opacity: f64,
-    /// What the Gaussians are rendered in front of.
-    /// Views without transparency are compared as they are: what is seen behind the object then is fitted, too.
+    /// Background of the renders. Views without transparency are compared as they are, with their background.
     pub background: Background,
     /// Views compared at each step.
     pub views_per_step: usize,
@@ -114,7 +113,7 @@ pub struct RefineConfig {
     pub growth_rounds: usize,
     /// Learning rates at the start.
     pub rates: Rates,
-    /// What the learning rate of the centres has become at the end, exponentially. The others stay as they are.
+    /// Learning rate of the centers at the end, reached exponentially. The others are constant.
     pub final_mean_rate: f64,
     /// Weight of 1 - SSIM; that of L1 is the rest. 0..1
     pub lambda_ssim: f64,

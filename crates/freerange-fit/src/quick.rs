@@ -11,9 +11,9 @@ use crate::{Evidence, FitConfig, FitError, FitProgress, config::check, fit};
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct QuickFitConfig {
-    /// Optimisation steps, one view each.
+    /// Optimization steps, one view each.
     pub iterations: usize,
-    /// Gaussians, from the start on.
+    /// Number of Gaussians.
     pub gaussians: usize,
     /// Longest side, in pixels, at which views are compared; larger ones are shrunk.
     pub render_size: u32,

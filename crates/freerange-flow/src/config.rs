@@ -15,7 +15,7 @@ use crate::{
     sample::{FlowConfig, GradientAt, RefinerConfig},
 };
 
-/// A whole training run, with what `M` knows of how its objects are made.
+/// A training run, with `M` for how its objects are made.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(deny_unknown_fields, bound(deserialize = "M: Making"))]
 pub struct TrainConfig<M = ()> {
@@ -30,7 +30,7 @@ pub struct TrainConfig<M = ()> {
     /// The loss and its terms; each can be switched off (the paper's ablations).
     #[serde(default)]
     pub loss: LossConfig,
-    /// The optimiser.
+    /// The optimizer.
     #[serde(default)]
     pub optimizer: OptimizerConfig,
     /// The curriculum, coarse to fine.
@@ -59,16 +59,16 @@ pub struct DataConfig<M = ()> {
     pub allow_incomplete: bool,
     /// Objects held in memory, from which each batch is drawn.
     pub window: usize,
-    /// Objects that leave the window, and new ones that enter it, with every step.
+    /// Objects of the window that are replaced at every step.
     pub fresh: usize,
     /// Threads that make or read objects beside training.
     pub workers: usize,
-    /// Object number i belongs to lane i mod `lanes`, and each lane has its share of window, fresh objects and batch: whoever
-    /// trains with as many processes as divide it trains the same, and each reads the objects of its own lanes only.
+    /// Virtual ranks. Object i belongs to virtual rank i mod `lanes`; each has its part of window, fresh objects and batch.
+    /// Any number of processes that divides it trains the same, and each reads only its own objects.
     pub lanes: usize,
-    /// Objects over which the normalisation statistics are measured before training.
+    /// Objects over which the normalization statistics are measured before training.
     pub statistics_objects: usize,
-    /// How objects are made. Its fields stand beside the others.
+    /// How objects are made. Its fields are beside the others.
     #[serde(flatten, skip_deserializing)]
     pub making: M,
 }
@@ -120,7 +120,7 @@ pub struct LossConfig {
     pub unconditional: f32,
     /// How noise is paired with Gaussians.
     pub coupling: Coupling,
-    /// Tokens of Gaussians picked at random instead of neighbours in the tree (an ablation of the paper).
+    /// Tokens of Gaussians picked at random instead of neighbors in the tree (an ablation of the paper).
     pub random_patches: bool,
     /// Fewest and most input views; the number is drawn for each batch.
     pub input_views: (usize, usize),
@@ -129,15 +129,15 @@ pub struct LossConfig {
     /// Share of the batches in which the network is fed its own estimate, made without a gradient just before
     /// (`model.estimate_channels`).
     pub self_conditioning: f32,
-    /// Most estimates that are made in such a batch, each from the one before; the number is drawn for each batch.
+    /// Most estimates made in such a batch, each from the one before; the number is drawn for each batch.
     pub estimates: usize,
     /// Where the gradient that the network sees is taken; at the noisy sample where there is no estimate.
     pub gradient_at: GradientAt,
-    /// Share of the batches whose input views all lie on one side of the object.
+    /// Fraction of the batches with partial observation: all input views on one side of the object.
     pub one_sided: f32,
-    /// How far the frame that an object is shown in is off its own. A user's frame is estimated from few views.
+    /// Random errors of the canonical frame, since a user's frame is estimated from few views.
     pub frame_jitter: FrameJitter,
-    /// Which other objects an object stands for, too: each time it is used, one of them is drawn.
+    /// Augmentation: a symmetric variant of the object is drawn each time it is used.
     pub symmetries: Symmetries,
 }
 
@@ -153,19 +153,17 @@ pub struct RefinementLoss {
     pub render_weight: f32,
 }
 
-/// Standard deviations of the normal distributions that a training object's frame is moved by; 0: not at all.
-/// Beyond two of them there is nothing.
+/// Standard deviations of a training object's frame errors, normal and cut at two of them. 0: none.
 #[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct FrameJitter {
     /// Of the logarithm of the factor on all lengths.
     pub scale: f32,
-    /// Of each coordinate of the centre (the object's sphere has radius 0.5).
+    /// Of each coordinate of the center (the object's sphere has radius 0.5).
     pub center: f32,
 }
 
-/// Changes that turn an object into another one that might as well have been in the data: see
-/// [`Symmetry`](crate::symmetry::Symmetry).
+/// Changes that turn an object into an equally likely one: see [`Symmetry`](crate::symmetry::Symmetry).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Symmetries {
@@ -208,13 +206,13 @@ pub struct OptimizerConfig {
     pub learning_rate: f64,
     /// Learning rate at the end.
     pub final_learning_rate: f64,
-    /// How it gets there.
+    /// Shape of the decrease.
     pub schedule: RateSchedule,
     /// Steps of linear warm-up.
     pub warmup: u64,
     /// Decoupled weight decay.
     pub weight_decay: f32,
-    /// What it applies to.
+    /// Parameters with weight decay.
     pub decay: Decay,
     /// First and second moment decay.
     pub betas: (f32, f32),
@@ -222,12 +220,12 @@ pub struct OptimizerConfig {
     pub clip: f32,
     /// Decay of the moving average of the weights (reached gradually over the first steps).
     pub ema: f32,
-    /// Arithmetic of the blocks, `f32`, `bf16` or `auto`, the faster on this device; weights and sums stay in 32 bits.
+    /// Precision of the blocks: `f32`, `bf16`, or `auto` for the faster on this device. Weights and sums stay in 32 bits.
     pub compute: Compute,
-    /// How gradients travel between ranks: `f32`, or `bf16` for half of the bytes.
+    /// All-reduce dtype of gradients: `f32`, or `bf16` for half of the bytes.
     pub wire: Wire,
-    /// Keep only the input of each block, and compute the block again for its gradient: a fraction of the memory for a
-    /// third more work.
+    /// Gradient checkpointing: keep only the input of each block and compute it again for the gradient. A fraction of the memory
+    /// for a third more work.
     pub recompute: bool,
 }
 
@@ -268,9 +266,9 @@ pub enum RateSchedule {
     /// Along half a cosine over the whole run.
     #[default]
     Cosine,
-    /// Not at all until the last `decay` steps, and linearly then: a run can be made longer at any time before.
+    /// Constant until the last `decay` steps, then linear. A run can be made longer at any time before.
     Constant {
-        /// Steps of the fall; 0: none.
+        /// Steps of the decrease; 0: none.
         decay: u64,
     },
 }
@@ -318,7 +316,7 @@ pub struct Stage {
     pub image_size: u32,
     /// Objects per step.
     pub batch: usize,
-    /// Objects that are computed at a time; gradients are averaged over a step's. Left out: all at once.
+    /// Objects computed at a time; gradients are averaged over a step's. Left out: all at once.
     #[serde(default)]
     pub micro_batch: Option<usize>,
     /// Side, in pixels, of the images that the rendering losses compare; left out: `loss.render_size`.

@@ -29,9 +29,9 @@ use crate::{
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ValidationConfig {
-    /// Steps from one measurement to the next; 0: none.
+    /// Steps between two measurements; 0: none.
     pub every: u64,
-    /// So many objects: of the shards' validation split, or generated from seeds of their own.
+    /// Number of objects: of the shards' validation split, or generated from seeds of their own.
     pub objects: usize,
 }
 

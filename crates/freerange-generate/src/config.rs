@@ -118,11 +118,11 @@ pub struct GeneratorConfig {
     pub lying_share: f32,
     /// Share of materials that start from white, cream or porcelain.
     pub white_share: f32,
-    /// Share of materials with a patterned texture instead of a plain colour.
+    /// Share of materials with a patterned texture instead of a plain color.
     pub pattern_share: f32,
-    /// Share of materials with a polished clear layer.
+    /// Share of materials with a glossy clear layer.
     pub gloss_share: f32,
-    /// Labels, writing and painted decoration. Without, each is its mean colour on otherwise the same object.
+    /// Labels, writing and painted decoration. Without, each is its mean color on otherwise the same object.
     pub prints: bool,
 }
 

@@ -96,7 +96,7 @@ pub struct ModelConfig {
     pub ffn: Option<usize>,
     /// Learned tokens that belong to neither image nor Gaussian.
     pub registers: usize,
-    /// How many neighbours in the tree's order share one token: 1, 2, 4 or 8.
+    /// Neighbors in the tree's order that share one token: 1, 2, 4 or 8.
     pub gaussians_per_token: usize,
     /// Learned tokens of a [`LatentTokens`](ModelKind::LatentTokens) model, which asks for them; 0 for every other kind.
     pub latent_tokens: usize,
@@ -108,18 +108,18 @@ pub struct ModelConfig {
     pub position_features: usize,
     /// Whether the photometric gradient is an input beside the noisy Gaussians.
     pub gradient_channels: bool,
-    /// Whether an earlier estimate of the clean Gaussians is one, too (self-conditioning: Chen et al. 2022; not the
-    /// paper's). Without one, zeros stand for it.
+    /// Self-conditioning (Chen et al. 2022; not the paper's): an earlier estimate of the clean Gaussians is an input, too; zeros
+    /// where there is none.
     pub estimate_channels: bool,
-    /// Whether what the input views show of that estimate is one, too: how much of each Gaussian they see, and in which colours
-    /// (not the paper's). Without an estimate, zeros stand for it.
+    /// Visibility features (not the paper's): how much of each Gaussian of that estimate the input views see, and in which
+    /// colors; zeros where there is none.
     pub observation_channels: bool,
-    /// Whether it is also told where each Gaussian of that estimate lies with respect to what the input views show: their outlines, the
-    /// surface, colours that agree (not the paper's). Needs `observation_channels`.
+    /// Silhouette features (not the paper's): where each Gaussian of that estimate lies with respect to the input views'
+    /// silhouettes, the surface, and colors that agree. Needs `observation_channels`.
     pub place_channels: bool,
-    /// With these, the last layer tells but the correction, of unit variance at all times, to what the noisy Gaussians and
-    /// the earlier estimate say together (preconditioning: Karras et al. 2022; not the paper's): standard deviations, one
-    /// per channel, of what such estimates are off by, in normalised units. Without an estimate they are 1.
+    /// Preconditioning (Karras et al. 2022; not the paper's): standard deviations, one per channel, of the errors of earlier
+    /// estimates, in normalized units. The last layer then predicts the correction alone, at unit variance. Without an
+    /// estimate they are 1.
     pub preconditioning: Option<[f32; CHANNELS]>,
 }
 

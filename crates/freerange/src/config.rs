@@ -75,7 +75,7 @@ pub enum Init {
 pub struct ProposeConfig {
     /// Where they come from.
     pub init: Init,
-    /// How many. The optimization begins with several together and is held at their mean renders where no photo looks.
+    /// How many. The optimization begins with several together and is anchored to their mean renders where no photo looks.
     pub count: usize,
     /// Initial fits: of the proposals, and of the object's place in the canonical frame.
     pub fit: QuickFitConfig,
@@ -214,7 +214,7 @@ pub struct Choices {
     pub symmetry: Option<Detect>,
     /// [`ProposeConfig::init`]
     pub init: Option<Init>,
-    /// Arithmetic of the network.
+    /// Precision of the network.
     pub precision: Option<Compute>,
     /// [`PipelineConfig::network_views`]
     pub network_views: Option<usize>,

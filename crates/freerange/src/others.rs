@@ -21,7 +21,7 @@ pub fn others_show(views: &[View]) -> Result<Vec<RgbaImage>, String> {
 }
 
 fn shown(views: &[View]) -> Result<Vec<RgbaImage>, Error> {
-    // Finer or longer fits mend no more (docs/experiments.md).
+    // Finer or longer fits mend no more (docs/research/experiments/masks.md).
     let config = QuickFitConfig { iterations: 150, gaussians: 2048, render_size: 128 };
     let (_, canonical) = to_canonical(views, &FrameConfig::default())?;
     let framed = |v: &View| Window::framed(v).map_or_else(|| v.clone(), |w| w.cut(v).into_owned());

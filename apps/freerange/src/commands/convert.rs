@@ -11,23 +11,24 @@ use crate::error::CliError;
 
 /// Convert Gaussians between formats, by the extensions of the files; merge, crop, clean and scale them.
 ///
-/// .glb and .spz have +y up by definition. The others are in whatever frame they were made in, which --frame tells:
-/// what is read is turned only where two files differ in it. An .html is a page that shows the Gaussians in any
-/// browser, offline. Read as well: compressed .ply (SuperSplat), .sog as a folder (its meta.json), .gltf. Of several
-/// inputs all Gaussians are written. The order of work: turn, merge, --box, --sphere, --remove-floaters, --measure.
+/// .glb and .spz have +y up by definition; --frame names the frame of the others. Gaussians are turned only where two files
+/// differ. An .html is a page that shows the Gaussians in any browser, offline. Compressed .ply (SuperSplat), .sog folders
+/// (meta.json) and .gltf can be read as well. Several inputs are merged. Order: turn, merge, --box, --sphere,
+/// --remove-floaters, --measure.
 ///
-/// --mesh renders depths from all around and fuses them; what no camera sees is taken for the inside.
+/// --mesh renders depths from all around and fuses them; what no camera sees counts as inside.
 #[derive(clap::Args)]
 pub struct Args {
-    /// Files to read, and at the end the file to write.
+    /// Files to read, then the file to write.
     #[arg(required = true, num_args = 2.., value_names = ["INPUT", "OUTPUT"])]
     files: Vec<PathBuf>,
-    /// Frame of files that do not fix their own: z-up (this program's), y-up, or y-down (most programs that train on
-    /// COLMAP's cameras) [default: z-up, or what a .ply says]. FROM:TO turns: FROM is the frame of what is read,
-    /// whatever its format says (many .spz are y-down), TO that of what is written.
+    /// Frame of formats that define none: z-up (this program), y-up or y-down [default: z-up, or what a .ply says].
+    ///
+    /// Most programs that train on COLMAP's cameras are y-down. FROM:TO turns: FROM is the frame of the input, whatever its format
+    /// says (many .spz are y-down), TO that of the output.
     #[arg(long, value_name = "FRAME")]
     frame: Option<Frames>,
-    /// Version of .spz to write: 3; 4, for newer readers; 2, for the oldest (rotations err by up to 10 degrees).
+    /// Version of .spz to write: 3, 4 (newer readers) or 2 (oldest readers, rotations off by up to 10 degrees).
     #[arg(long, value_name = "VERSION", default_value = "3")]
     spz_version: SpzVersion,
     /// Keep only Gaussians whose centers lie between two corners: X,Y,Z:X,Y,Z, in the written frame.
@@ -36,7 +37,7 @@ pub struct Args {
     /// Keep only Gaussians whose centers lie in a sphere: X,Y,Z:RADIUS.
     #[arg(long, value_name = "CENTER:RADIUS", value_parser = parse_sphere, allow_hyphen_values = true)]
     sphere: Option<(DVec3, f64)>,
-    /// Leave out Gaussians that are connected to nothing large.
+    /// Remove small groups of Gaussians that are apart from the object.
     #[arg(long)]
     remove_floaters: bool,
     /// Scale about the origin so that two points are LENGTH apart: X,Y,Z:X,Y,Z=LENGTH.
@@ -45,13 +46,13 @@ pub struct Args {
     /// Write a closed triangle mesh of the surface, with vertex colors or a texture: .glb, .ply or .obj.
     #[arg(long)]
     mesh: bool,
-    /// Voxels along the longest side, of which the mesh is made.
+    /// Voxels along the longest side of the mesh's volume.
     #[arg(long, value_name = "COUNT", default_value_t = MeshConfig::default().voxels, requires = "mesh")]
     voxels: usize,
-    /// Most triangles of the mesh [default: as many as the voxels give; 20,000 with --texture].
+    /// Most triangles of the mesh [default: no limit; 20,000 with --texture].
     #[arg(long, value_name = "COUNT", requires = "mesh")]
     triangles: Option<usize>,
-    /// Give the mesh a texture so many texels wide instead of vertex colors: 64 to 4096, .glb only.
+    /// Width of a texture instead of vertex colors: 64 to 4096, .glb only.
     #[arg(long, value_name = "TEXELS", requires = "mesh")]
     texture: Option<usize>,
 }

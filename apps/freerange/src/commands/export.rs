@@ -13,15 +13,15 @@ use crate::{error::CliError, output::OutputFolder, runtime};
 /// Arguments of `model export`.
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folder to write: config.json, model.safetensors and README.md, as model hubs expect them.
+    /// Output folder: config.json, model.safetensors and README.md, as model hubs expect them.
     output: PathBuf,
-    /// Checkpoint to export instead of the shipped one: a file, or hf:owner/name[@revision].
+    /// Checkpoint to export: a file, or hf:OWNER/NAME[@REVISION] [default: the built-in one].
     #[arg(long, value_name = "FILE", requires = "license")]
     checkpoint: Option<PathBuf>,
-    /// Licences of the model, as hubs call them [default: mit,apache-2.0 of the shipped checkpoint].
+    /// Licenses of the model, by their hub names [default: mit,apache-2.0 of the built-in model].
     #[arg(long, value_name = "LICENCES", value_delimiter = ',', value_parser = parse_license)]
     license: Vec<String>,
-    /// Title of the card [default: free-range].
+    /// Title of the card.
     #[arg(long, default_value = "free-range")]
     name: String,
 }
@@ -31,7 +31,7 @@ fn parse_license(text: &str) -> Result<String, String> {
     let plain = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || "-._".contains(c);
     match !text.is_empty() && text.chars().all(plain) {
         true => Ok(text.into()),
-        false => Err("expected a hub's name of a licence, such as mit or cc-by-4.0".into()),
+        false => Err("expected a hub's name of a license, such as mit or cc-by-4.0".into()),
     }
 }
 

@@ -20,32 +20,32 @@ use crate::{
     runtime::local_or_shipped,
 };
 
-/// Show what is understood of a scene: cameras, masks, place and size of the object, and what may go wrong.
+/// Check a scene before reconstruction: cameras, masks, place and size of the object, and warnings.
 ///
-/// Writes inspect.png (the cameras from above, and every photo with its mask and the object's sphere), inspect.json, and masks/ (to be
-/// mended and given back with --masks).
+/// Writes inspect.png (the cameras from above, every photo with its mask and the object's sphere), inspect.json and masks/.
+/// Corrected masks can be used with --masks.
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folder of photos with cameras (transforms.json, COLMAP, Polycam, Metashape, RealityCapture), or such a file.
+    /// Folder with photos and cameras (transforms.json, COLMAP, Polycam, Metashape, RealityCapture, OPF), or the camera file.
     scene: PathBuf,
-    /// Where the files go.
+    /// Output folder.
     #[arg(short, long, default_value = "inspect")]
     output: PathBuf,
     #[command(flatten)]
     photos: Photos,
-    /// Which way is up in the scene's frame: z, y, cameras (where the tops of the photos point), a direction X,Y,Z, or auto.
+    /// Up axis of the scene: auto, z, y, cameras (tops of the photos), or a direction X,Y,Z.
     #[arg(long, default_value = "auto", allow_hyphen_values = true)]
     up: UpChoice,
-    /// Model whose number of views is taken, instead of the shipped one's: as in `reconstruct`.
+    /// Model whose number of network views is used [default: the built-in one].
     #[arg(long, value_name = "FILE", conflicts_with = "views")]
     checkpoint: Option<PathBuf>,
-    /// Views that the model would be shown [default: as `reconstruct`].
+    /// Most photos that the network would see [default: as in `reconstruct`].
     #[arg(long, value_name = "K", value_parser = clap::value_parser!(u16).range(1..=256))]
     views: Option<u16>,
-    /// Also write the views as they are used, cut out and without their lens, with a transforms.json: into cut/, for other programs.
+    /// Also write cut/: the photos undistorted and masked, with a transforms.json, for other programs.
     #[arg(long)]
     cut: bool,
-    /// Print what is understood as JSON.
+    /// Print the report as JSON.
     #[arg(long)]
     json: bool,
 }

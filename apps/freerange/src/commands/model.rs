@@ -13,15 +13,16 @@ use crate::{
     runtime::{self, TrainConfig},
 };
 
-/// Look at models.
+/// Inspect, shrink, average and export models.
 #[derive(clap::Subcommand)]
 pub enum Command {
-    /// Shapes, parameters per part, arithmetic and memory. Of a configuration, nothing is allocated.
+    /// Print shapes, parameters per part, operations and memory of a model or a configuration.
     Info(Info),
-    /// Write a checkpoint with weights of 16 bits: half the size, the same results to three digits.
+    /// Write a checkpoint with 16-bit weights: half the size, the same results to three digits.
     Shrink(Shrink),
-    /// Write the mean of checkpoints, weight by weight: of runs that began with the same weights, on machines that need not know
-    /// each other, it is often better than any one of them.
+    /// Write the mean of checkpoints, weight by weight.
+    ///
+    /// For runs that began with the same trained weights and differ in their seeds.
     Average(Average),
     /// Write a folder in the layout of model hubs: weights, configuration and a card.
     Export(super::export::Args),
@@ -30,18 +31,18 @@ pub enum Command {
 /// Arguments of `model info`.
 #[derive(clap::Args)]
 pub struct Info {
-    /// Training configuration (.toml) or checkpoint (.safetensors) [default: the shipped checkpoint].
+    /// Training configuration (.toml) or checkpoint (.safetensors) [default: the built-in checkpoint].
     file: Option<PathBuf>,
-    /// Folder of the weights of the checkpoint's frozen encoder: see `freerange reconstruct`.
+    /// Weights of the checkpoint's frozen encoder: see `freerange reconstruct`.
     #[arg(long, value_name = "FOLDER")]
     encoder_weights: Option<PathBuf>,
-    /// Samples at once [default: the last stage's batch, or 1].
+    /// Objects per batch [default: the last stage's batch, or 1].
     #[arg(long)]
     batch: Option<usize>,
-    /// Input images per sample.
+    /// Input images per object.
     #[arg(long, default_value_t = 4)]
     views: usize,
-    /// Memory as on a GPU, where activations can be of 16 bits, and scores are held in larger pieces.
+    /// Memory as on a GPU: activations of 16 bits where possible, attention scores in larger pieces.
     #[arg(long)]
     gpu: bool,
     /// Print JSON.
@@ -56,11 +57,10 @@ pub struct Shrink {
     input: PathBuf,
     /// Checkpoint to write.
     output: PathBuf,
-    /// Folder of the weights of the checkpoint's frozen encoder: see `freerange reconstruct`.
+    /// Weights of the checkpoint's frozen encoder: see `freerange reconstruct`.
     #[arg(long, value_name = "FOLDER")]
     encoder_weights: Option<PathBuf>,
-    /// Sample by default as this configuration's table `sample` says (a file, or tiny, base or paper), not as the one
-    /// that the model was trained with.
+    /// Configuration whose table `sample` becomes the checkpoint's default: a file, or tiny, base or paper.
     #[arg(long, value_name = "CONFIG")]
     sampling: Option<PathBuf>,
 }
@@ -68,13 +68,13 @@ pub struct Shrink {
 /// Arguments of `model average`.
 #[derive(clap::Args)]
 pub struct Average {
-    /// Checkpoints to read. What is no weight is the first one's.
+    /// Checkpoints to average. Settings are those of the first one.
     #[arg(required = true, value_name = "CHECKPOINT")]
     inputs: Vec<PathBuf>,
     /// Checkpoint to write.
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// Folder of the weights of the checkpoints' frozen encoder: see `freerange reconstruct`.
+    /// Weights of the checkpoints' frozen encoder: see `freerange reconstruct`.
     #[arg(long, value_name = "FOLDER")]
     encoder_weights: Option<PathBuf>,
 }

@@ -34,52 +34,51 @@ use holdout::Holdout;
 
 /// Reconstruct an object from posed photos.
 ///
-/// Writes gaussians.ply (in the frame of your cameras; --format for others), turntable.gif, inputs/ (each photo beside its
-/// render) and report.json. Of several scenes each gets such a folder in the output, and scenes.json is their table; finished
-/// scenes are skipped, and a failing scene does not stop the others.
+/// Writes gaussians.ply in the frame of the cameras, turntable.gif, inputs/ (each photo beside its render) and report.json.
+/// Several scenes get a folder each, and scenes.json lists them. Finished scenes are skipped; a failing scene does not stop
+/// the others.
 #[derive(clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct Args {
-    /// Folder of photos with cameras (transforms.json, COLMAP, Polycam, Metashape, RealityCapture, OPF), or the file of cameras;
-    /// several are made one after the other.
+    /// Folder with photos and cameras (transforms.json, COLMAP, Polycam, Metashape, RealityCapture, OPF), or the camera file.
     #[arg(required_unless_present = "list")]
     scene: Vec<PathBuf>,
-    /// Where the results go.
+    /// Output folder.
     #[arg(short, long, default_value = "out", help_heading = "Results")]
     output: PathBuf,
     /// Also write splat, spz, sog, glb, usda, usdz, html (a page), mesh.glb, mesh.ply, mesh.obj or colmap.
     ///
-    /// Several with commas between them. Meshes are triangles with vertex colors. colmap is a folder with the photos, their cameras, and
-    /// the Gaussians' centers as points.
+    /// Separate several by commas. Meshes have vertex colors. colmap is a folder of photos, cameras, and the Gaussians' centers as points.
     #[arg(long, value_name = "FORMATS", value_delimiter = ',', value_parser = parse_written, help_heading = "Results")]
     format: Vec<Written>,
-    /// Samples to draw; they differ where the photos leave the object open.
+    /// Number of results with different seeds; they differ most where no photo looks.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64), hide_short_help = true, help_heading = "Results")]
     samples: u32,
     /// Print the report as JSON on standard output.
     #[arg(long, hide_short_help = true, help_heading = "Results")]
     json: bool,
-    /// Hold out every N-th photo and compare with it.
+    /// Hold out every Nth photo and score the result on it.
     #[arg(long, value_name = "N", conflicts_with = "holdout", value_parser = clap::value_parser!(u32).range(2..), help_heading = "Comparison")]
     holdout_every: Option<u32>,
-    /// Hold out the photos of these names (NAME,NAME) and compare with them.
+    /// Hold out the photos of these names (NAME,NAME) and score the result on them.
     #[arg(long, value_name = "NAMES", value_delimiter = ',', hide_short_help = true, help_heading = "Comparison")]
     holdout: Vec<String>,
-    /// Another scene of the same object, only compared with.
+    /// Also score the result on the views of another scene of the object.
     #[arg(long, value_name = "SCENE", help_heading = "Comparison")]
     eval_scene: Option<PathBuf>,
     #[command(flatten)]
     pipeline: PipelineArgs,
     #[command(flatten)]
     photos: Photos,
-    /// A file that names a scene on each line, relative to itself; lines that begin with # are skipped.
+    /// File with a scene on each line, relative to the file; lines that begin with # are skipped.
     #[arg(long, value_name = "FILE", help_heading = "Many scenes")]
     list: Option<PathBuf>,
-    /// Make only part I of N (from 0) of the scenes, as in an array of jobs. Processes of mpirun or srun share them by
-    /// themselves.
+    /// Reconstruct only part I of N of the scenes, I from 0 to N - 1.
+    ///
+    /// For arrays of jobs. Processes of mpirun or srun divide the scenes by themselves.
     #[arg(long, value_name = "I/N", value_parser = shard, hide_short_help = true, help_heading = "Many scenes")]
     shard: Option<(usize, usize)>,
-    /// Make finished scenes again.
+    /// Reconstruct finished scenes again.
     #[arg(long, hide_short_help = true, help_heading = "Many scenes")]
     overwrite: bool,
 }
@@ -248,7 +247,9 @@ fn run_in(args: &Args, job: &Job) -> Result<(), CliError> {
         return batch::run(args, job);
     }
     if args.overwrite {
-        return Err(CliError::input("--overwrite: expected several scenes, found one: it is always made again"));
+        return Err(CliError::input(
+            "--overwrite: expected several scenes, found one, which is always reconstructed again",
+        ));
     }
     let begin = Instant::now();
     let path = &args.scene[0];

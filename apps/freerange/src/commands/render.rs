@@ -16,18 +16,18 @@ use crate::{error::CliError, output::OutputFolder, progress::Progress};
 pub struct Args {
     /// Gaussians: .ply, .splat, .spz, .sog (or its meta.json), .glb, .gltf, or .html that this program wrote.
     file: PathBuf,
-    /// transforms.json, or the folder that holds it; images are not needed where it says `w` and `h`.
+    /// File transforms.json or its folder; images are not needed if it has `w` and `h`.
     #[arg(long, value_name = "TRANSFORMS.json")]
     cameras: PathBuf,
-    /// Frame of the cameras, to which .glb and .spz (+y up) are turned: z-up, y-up or y-down. FROM:TO tells that of the
-    /// file as well, whatever it says.
+    /// Frame of the cameras: z-up, y-up or y-down. FROM:TO also sets that of the Gaussians.
+    ///
+    /// .glb and .spz have +y up and are turned to the cameras' frame. FROM overrides what a file says.
     #[arg(long, default_value = "z-up")]
     frame: Frames,
-    /// How to draw: default (blur of 0.3 square pixels) or mip (0.1, with lowered opacities) [default: as a .ply or .sog
-    /// says].
+    /// Antialiasing: default (0.3 square pixels) or mip (0.1, with compensated opacities) [default: the file's].
     #[arg(long, value_name = "MODE", value_parser = parse_mode)]
     mode: Option<RenderMode>,
-    /// Where the pictures go.
+    /// Output folder.
     #[arg(short, long, default_value = "renders")]
     output: PathBuf,
 }
@@ -65,6 +65,6 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     }
     bar.finish();
     output.commit()?;
-    println!("{} pictures in {}", cameras.len(), args.output.display());
+    println!("{} images in {}", cameras.len(), args.output.display());
     Ok(())
 }

@@ -16,7 +16,7 @@ use image::RgbaImage;
 
 use crate::{error::CliError, pipeline::PipelineArgs, ranks::Job, signals::Signals};
 
-/// Serve a page: drop photos with cameras, mend masks, and watch the Gaussians appear.
+/// Serve a web page: drop photos with cameras, correct masks, watch the Gaussians appear.
 ///
 /// Listens on this machine only and loads nothing from elsewhere. Options of the pipeline are the defaults of its jobs. Ctrl-C ends it.
 #[derive(clap::Args)]
@@ -30,17 +30,18 @@ pub struct Args {
     /// Address to listen at; beyond this machine (0.0.0.0) it needs --token.
     #[arg(long, default_value = "127.0.0.1", value_name = "ADDRESS")]
     host: IpAddr,
-    /// What clients have to know: 16 letters, digits or - . _ ~, or more. Browsers: http://ADDRESS/?token=TOKEN; programs: the header
-    /// `Authorization: Bearer TOKEN`.
+    /// Access token: at least 16 letters, digits or - . _ ~.
+    ///
+    /// Browsers open http://ADDRESS/?token=TOKEN. Programs send the header `Authorization: Bearer TOKEN`.
     #[arg(long)]
     token: Option<String>,
-    /// A name, beside addresses, under which browsers reach the page; may be repeated.
+    /// Allowed Host header beside addresses, such as the name behind a proxy; may be repeated.
     #[arg(long, value_name = "HOST")]
     name: Vec<String>,
-    /// Keep jobs in this folder: they outlive the server [default: a temporary folder, taken away at the end].
+    /// Folder that keeps jobs beyond the server's end [default: a temporary folder].
     #[arg(long, value_name = "FOLDER")]
     keep: Option<PathBuf>,
-    /// Longest time that a job may compute, in seconds.
+    /// Most seconds that a job may compute.
     #[arg(long, value_name = "SECONDS", default_value_t = 900, value_parser = clap::value_parser!(u64).range(1..=604_800))]
     max_time: u64,
     /// Most megabytes of files per job.
@@ -49,7 +50,7 @@ pub struct Args {
     /// Most megapixels per photo.
     #[arg(long, value_name = "MP", default_value_t = 50, value_parser = clap::value_parser!(u64).range(1..=268))]
     max_pixels: u64,
-    /// Most jobs that are looked at, wait or compute.
+    /// Most open jobs: in preparation, waiting or computing.
     #[arg(long, value_name = "JOBS", default_value_t = 32, value_parser = clap::value_parser!(u16).range(1..=10_000))]
     max_jobs: u16,
     #[command(flatten)]

@@ -32,43 +32,44 @@ use crate::{
     signals::Signals,
 };
 
-/// Train a model. Run the same command again to go on where it was stopped.
+/// Train a model. Run the same command again to continue a stopped run.
 ///
-/// Writes checkpoint.safetensors (averaged weights), log.jsonl (one line per step), the same for TensorBoard (events.out.tfevents.*, with
-/// pictures of validation samples) and the state to go on from; with `[validation]` in the configuration also best.safetensors, the
-/// weights that measured best on other objects. Built with `--features mpi` and started as several processes by mpirun or srun, these
-/// train one model together.
+/// Writes checkpoint.safetensors (averaged weights), log.jsonl (one line per step), events for TensorBoard, and the state to continue
+/// from. With `[validation]` in the configuration, best.safetensors has the weights that measured best on other objects. A build with
+/// `--features mpi` trains one model with several processes of mpirun or srun.
 #[derive(clap::Args)]
 pub struct Args {
     /// Configuration: a file such as configs/tiny.toml, or tiny, base or paper.
     config: PathBuf,
-    /// Folder of the run.
+    /// Output folder of the run.
     #[arg(short, long, required_unless_present = "dry_run")]
     output: Option<PathBuf>,
-    /// Build the whole model with random weights, say what a step of each stage needs, and end: neither data nor encoder
-    /// weights are looked for.
+    /// Build the model with random weights and print what a step of each stage needs.
+    ///
+    /// Needs neither data nor encoder weights.
     #[arg(long)]
     dry_run: bool,
-    /// Checkpoint whose weights a new run starts from.
+    /// Checkpoint whose weights a new run begins with [default: random weights].
     #[arg(long, value_name = "FILE")]
     initial: Option<PathBuf>,
-    /// Folder of the weights (config.json, model.safetensors) of the frozen encoder [default: what `weights` in the
-    /// configuration's [model.encoder] names].
+    /// Weights of the frozen encoder: a folder with config.json and model.safetensors.
+    ///
+    /// Without it, `weights` in [model.encoder] of the configuration is used.
     #[arg(long, value_name = "FOLDER")]
     encoder_weights: Option<PathBuf>,
-    /// With --initial: normalise by the statistics of this run's data instead of the checkpoint's, for data made otherwise.
+    /// With --initial: compute normalization statistics from this run's data instead of the checkpoint's.
     #[arg(long, requires = "initial")]
     remeasure: bool,
-    /// Stop after so many minutes (the state is saved, as it is at Ctrl-C and SIGTERM).
+    /// Stop after this many minutes and save the state, as at Ctrl-C and SIGTERM.
     #[arg(long)]
     minutes: Option<f64>,
     /// Steps between two saved states.
     #[arg(long, default_value_t = 250, value_parser = clap::value_parser!(u64).range(1..))]
     save_every: u64,
-    /// Where to compute: auto, cpu, or cuda, metal, vulkan, webgpu with a number if there are several, as in cuda:1.
+    /// Device: auto, cpu, cuda, metal, vulkan or webgpu, with a number as in cuda:1.
     #[arg(long, default_value = "auto")]
     device: DeviceName,
-    /// How several processes add up their gradients.
+    /// All-reduce backend of several processes.
     #[arg(long, value_enum, default_value_t)]
     sums: Sums,
 }

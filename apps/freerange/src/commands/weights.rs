@@ -7,9 +7,9 @@ use crate::error::CliError;
 /// List and download the published weights of metrics.
 #[derive(clap::Subcommand)]
 pub enum Command {
-    /// List the sets of weights, what they are for, and whether they are there.
+    /// List the sets of weights, their use, and whether they are present.
     List(List),
-    /// Download sets of weights from where their authors publish them, and check them.
+    /// Download sets of weights from their authors and check them.
     Fetch(Fetch),
 }
 
@@ -31,7 +31,7 @@ pub struct Fetch {
     names: Vec<String>,
     #[command(flatten)]
     weights: WeightsArgs,
-    /// Address of the Hugging Face hub or of a mirror of it.
+    /// Address of the Hugging Face hub or a mirror.
     #[arg(long, value_name = "URL", default_value = "https://huggingface.co")]
     hub: String,
 }

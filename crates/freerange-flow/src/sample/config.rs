@@ -32,7 +32,7 @@ pub struct FlowConfig {
     pub background: Background,
     /// How the starting noise is grouped into tokens: as in training.
     pub coupling: Coupling,
-    /// Arithmetic of the transformer's blocks.
+    /// Precision of the transformer's blocks.
     pub compute: Compute,
 }
 
@@ -65,7 +65,7 @@ pub struct RefinerConfig {
     pub lod_depth: Option<u32>,
     /// Side, in pixels, of the renders that gradients are taken on: as in training.
     pub gradient_size: u32,
-    /// Arithmetic of the transformer's blocks.
+    /// Precision of the transformer's blocks.
     pub compute: Compute,
 }
 

@@ -1,5 +1,5 @@
 //! Network refinement of Gaussians that are there already: what the shipped model is trained for (beyond the paper,
-//! docs/decisions.md).
+//! docs/research/decisions.md).
 
 use std::ops::ControlFlow;
 

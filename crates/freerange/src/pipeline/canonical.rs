@@ -2,7 +2,7 @@
 //! about the origin, +z up), cropped to squares about the object, and the choice of those that the network sees.
 //!
 //! Masks and cameras give a first frame; where the scene does not already lie in the canonical one, a short fit corrects it
-//! (docs/experiments.md, "The frame"). Cost: a third of a second for that fit.
+//! (docs/research/experiments/initial-fits.md). Cost: a third of a second for that fit.
 
 use freerange_camera::{CanonicalFrame, FrameConfig, Similarity, View, Window, canonical_from_user, inputs_around};
 use freerange_core::Note;

@@ -1,6 +1,6 @@
 //! Step 5, optimize. In: refined proposals and all targets. Out: one set of Gaussians, up to
 //! [`max_gaussians`](crate::OptimizeConfig::max_gaussians), by 3DGS-MCMC on the photos from all proposals together. Where no
-//! photo looks, the mean renders of the proposals hold it ([`freerange_fit::refine`]; docs/experiments.md, "Ensembles").
+//! photo looks, the mean renders of the proposals hold it ([`freerange_fit::refine`]; docs/research/experiments/proposals.md).
 //!
 //! Cost: half of the pipeline's time; memory of the photos at `max_resolution`.
 

@@ -1,5 +1,5 @@
 //! Step 4, refine. In: proposals of any number of Gaussians, and the network's views. Out: as many sets of `2^lod_depth`
-//! Gaussians, each corrected by the network ([`Refiner`]; docs/decisions.md). A model without a refiner leaves proposals as
+//! Gaussians, each corrected by the network ([`Refiner`]; docs/research/decisions.md). A model without a refiner leaves proposals as
 //! they are.
 //!
 //! Cost: `passes` evaluations of the network for each proposal, 7 seconds of two cores for four.

@@ -2,7 +2,7 @@
 //! steps that follow, photos and what a symmetry adds to them: mirrored photos as further views, rotated silhouettes.
 //!
 //! A symmetry is believed where a fit of photos and additions together still agrees with the photos
-//! ([`find_mirror`], [`find_axis`]; docs/experiments.md, "Mirrored photos" and "Turned outlines"). Cost: seven seconds of
+//! ([`find_mirror`], [`find_axis`]; docs/research/experiments/symmetry.md). Cost: seven seconds of
 //! two cores.
 
 use std::ops::ControlFlow;

@@ -15,31 +15,31 @@ use crate::{
     runtime,
 };
 
-/// Measure speed on a device: the rasteriser, a transformer block, sampling, training.
+/// Benchmark a device: the rasterizer, a transformer block, sampling, training.
 ///
 /// Prints Markdown tables with the machine, the commit and the command. Weights are random, objects generated. Times are
-/// medians of calls that were waited for.
+/// medians of synchronized calls.
 #[derive(clap::Args)]
 pub struct Args {
-    /// Where to compute: see `freerange devices`.
+    /// Device: see `freerange devices`.
     #[arg(long, default_value = "auto")]
     device: DeviceName,
-    /// With --only sum: how processes add up.
+    /// All-reduce backend of --only sum.
     #[arg(long, value_enum, default_value_t)]
     sums: Sums,
-    /// What to measure.
+    /// Parts to measure.
     #[arg(long, value_enum, value_delimiter = ',', default_values_t = Part::ALL)]
     only: Vec<Part>,
-    /// Configurations of block, sampling and training: names or files [default: tiny; on a GPU tiny, base and paper].
+    /// Configurations for block, sample and train: names or files [default: tiny; on a GPU tiny, base and paper].
     #[arg(long, value_delimiter = ',')]
     sizes: Vec<String>,
-    /// Gaussians per object, of the rasteriser.
+    /// Gaussians per object, for the rasterizer.
     #[arg(long, value_delimiter = ',', default_values_t = [2048, 8192, 50_000])]
     gaussians: Vec<usize>,
-    /// Images per call, of the rasteriser.
+    /// Images per call, for the rasterizer.
     #[arg(long, value_delimiter = ',', default_values_t = [1, 4, 16, 64])]
     images: Vec<usize>,
-    /// Image sizes in pixels, of the rasteriser.
+    /// Image sizes in pixels, for the rasterizer.
     #[arg(long, value_delimiter = ',', default_values_t = [224, 512])]
     pixels: Vec<u32>,
     /// Steps of a whole reconstruction.
@@ -48,10 +48,10 @@ pub struct Args {
     /// Objects per batch of a whole reconstruction.
     #[arg(long, default_value_t = 1)]
     objects: usize,
-    /// Arithmetic of the transformer [default: bf16 where the device has it, else f32].
+    /// Precision of the transformer [default: bf16 where the device has it, else f32].
     #[arg(long, value_parser = parse_precision)]
     precision: Option<Compute>,
-    /// Seconds to measure each line for, at least three calls.
+    /// Seconds per measurement, at least three calls.
     #[arg(long, default_value_t = 1.0)]
     seconds: f64,
     /// Print JSON.
@@ -62,7 +62,7 @@ pub struct Args {
 /// What can be measured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum Part {
-    /// The rasteriser, forward and with its gradient.
+    /// The rasterizer, forward and with its gradient.
     Raster,
     /// Attention and one transformer block.
     Block,
@@ -70,7 +70,7 @@ enum Part {
     Sample,
     /// Training steps.
     Train,
-    /// Sums over the processes of a launcher, of as many numbers as a model has: in 32 bits and in bf16. Alone.
+    /// All-reduce of a model's gradients over the launched processes, in f32 and bf16. Cannot be combined.
     Sum,
 }
 

@@ -42,13 +42,14 @@ pub struct GenerateArgs {
 /// Which meshes.
 #[derive(clap::Args)]
 pub struct InputArgs {
-    /// Folder of .glb, .gltf, .obj and .ply files, one such file, or a list: a .jsonl file of lines like
-    /// {"path": "chair.glb", "licence": "CC-BY-4.0", "source": "...", "id": "...", "split": "train"}.
+    /// Folder of .glb, .gltf, .obj and .ply files, one such file, or a list (.jsonl).
+    ///
+    /// Lines of a list: {"path": "chair.glb", "licence": "CC-BY-4.0", "source": "...", "id": "...", "split": "train"}.
     input: PathBuf,
-    /// Licence of the meshes (SPDX), where a list does not say it.
+    /// License of the meshes (SPDX), for files whose list entry has none.
     #[arg(long, default_value = "unknown")]
     licence: String,
-    /// Put before each file's path to say where it comes from, where a list does not say it.
+    /// Prefix of each file's path in its metadata, for files whose list entry has no source.
     #[arg(long, default_value = "")]
     source: String,
 }
@@ -75,40 +76,40 @@ pub struct Settings {
     /// Configuration whose table `data` is used: tiny, base, paper, or a file.
     #[arg(long, default_value = "tiny")]
     config: PathBuf,
-    /// Seed of what is drawn for the objects: cameras, light, fits, splits.
+    /// Random seed of cameras, light, fits and splits [default: the configuration's].
     #[arg(long)]
     seed: Option<u64>,
-    /// Where the Gaussians come from: a 3DGS-MCMC fit of the views, or points on the surface (fast, and less exact).
+    /// Target Gaussians: a 3DGS-MCMC fit, or points on the surface (faster, less exact).
     #[arg(long, value_enum)]
     gaussians: Option<Source>,
-    /// Gaussians before the tree.
+    /// Gaussians of the full fit, before the level-of-detail tree [default: the configuration's].
     #[arg(long, value_name = "N")]
     leaves: Option<usize>,
-    /// Keep the Gaussians before the tree, too.
+    /// Also store the full fit.
     #[arg(long)]
     keep_leaves: bool,
-    /// Depths of the slices to keep, such as 8,10,12.
+    /// Depths of the stored slices, such as 8,10,12 [default: the configuration's].
     #[arg(long, value_delimiter = ',')]
     depths: Option<Vec<u32>>,
-    /// Views per object.
+    /// Views per object [default: the configuration's].
     #[arg(long)]
     views: Option<usize>,
-    /// Width and height of the views in pixels.
+    /// Width and height of the views in pixels [default: the configuration's].
     #[arg(long)]
     resolution: Option<u32>,
-    /// Iterations of the fit.
+    /// Steps of the full fit [default: the configuration's].
     #[arg(long)]
     iterations: Option<usize>,
-    /// Gradient steps that adapt each slice to the views; 0: slices are what the tree says.
+    /// Optimization steps on each slice; 0 keeps the tree's slices [default: the configuration's].
     #[arg(long)]
     polish: Option<usize>,
-    /// Quick fits of some of the views per object, as sampling starts from.
+    /// Initial fits of a few views, stored with each object [default: the configuration's].
     #[arg(long, value_name = "N")]
     fits: Option<usize>,
-    /// Objects per shard.
+    /// Objects per shard [default: the configuration's].
     #[arg(long)]
     objects_per_shard: Option<u64>,
-    /// Least PSNR, in dB on held-out views, of an object to train on.
+    /// Least PSNR in dB on held-out views; worse objects are flagged [default: the configuration's].
     #[arg(long)]
     min_psnr: Option<f64>,
 }
@@ -155,17 +156,18 @@ impl Settings {
 /// How the work is done. None of it changes what comes out.
 #[derive(clap::Args)]
 struct Work {
-    /// Where the shards go: a folder, or s3://bucket/prefix or gs://bucket/prefix (built with --features cloud).
+    /// Output folder, or s3://BUCKET/PREFIX or gs://BUCKET/PREFIX (build with --features cloud).
     #[arg(short, long)]
     output: String,
-    /// Make only the i-th of n shares of the shards, i from 0 to n - 1. Any number of machines may work side by side
-    /// on one output.
+    /// Build only part I of N of the shards, I from 0 to N - 1.
+    ///
+    /// Any number of machines may share one output.
     #[arg(long, value_name = "I/N", default_value = "0/1")]
     shard: Share,
-    /// Objects made at once; as many as there are cores if not given. Memory grows with it.
+    /// Objects built at once; memory grows with it [default: number of cores].
     #[arg(long, default_value_t = 0, hide_default_value = true)]
     workers: usize,
-    /// Try again what could not be made before.
+    /// Try failed objects again.
     #[arg(long)]
     retry_failed: bool,
     /// Print a line per object.

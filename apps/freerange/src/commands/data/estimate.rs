@@ -15,10 +15,10 @@ pub struct Args {
     input: InputArgs,
     #[command(flatten)]
     settings: Settings,
-    /// Objects that are made to measure, evenly spread over the input; those of a temporary folder, removed at the end.
+    /// Objects to measure, evenly spread over the input.
     #[arg(long, default_value_t = 8)]
     sample: u64,
-    /// Objects that the costs are given for; those of the input if not given.
+    /// Objects to estimate the cost of [default: those of the input].
     #[arg(long)]
     objects: Option<u64>,
     /// Print JSON.

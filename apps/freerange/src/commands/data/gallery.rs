@@ -9,19 +9,19 @@ use crate::{error::CliError, runtime::TrainConfig};
 /// Arguments of `data gallery`.
 #[derive(clap::Args)]
 pub struct Args {
-    /// The PNG file to write.
+    /// PNG file to write.
     #[arg(short, long, default_value = "gallery.png")]
     output: PathBuf,
     /// Configuration whose generator and lighting are used: tiny, base, paper, or a file.
     #[arg(long, default_value = "tiny")]
     config: PathBuf,
-    /// Objects.
+    /// Number of objects.
     #[arg(long, default_value_t = 100)]
     objects: u32,
-    /// Objects side by side.
+    /// Objects per row.
     #[arg(long, default_value_t = 10)]
     columns: u32,
-    /// Width and height of each, in pixels.
+    /// Width and height of each image in pixels.
     #[arg(long, default_value_t = 160)]
     tile: u32,
     /// Seed of the first object.

@@ -12,8 +12,9 @@ use crate::error::CliError;
 pub struct Args {
     /// Folder or URL of shards.
     location: String,
-    /// Write a contact sheet of the first objects to this PNG file: two views, three slices, and the Gaussians before the
-    /// tree where they are kept.
+    /// Write a contact sheet of the first objects to this PNG file.
+    ///
+    /// It shows two views, three slices, and the full fit where it is stored.
     #[arg(long, value_name = "FILE")]
     sheet: Option<PathBuf>,
     /// Objects on the sheet.
@@ -51,7 +52,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         report.bytes as f64 / 1e6,
         if report.complete { "complete" } else { "unfinished" }
     );
-    println!("parts: {}; licences: {}", counts(&report.splits), counts(&report.licences));
+    println!("parts: {}; licenses: {}", counts(&report.splits), counts(&report.licences));
     if let (Some(views), Some([w, h]), Some(sets)) = (report.views, report.image_size, report.evaluation) {
         let sets = if sets { "with" } else { "too few for" };
         println!("depths {:?}; {views} views of {w} x {h} pixels, {sets} sets for evaluation", report.depths);

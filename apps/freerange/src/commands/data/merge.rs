@@ -8,9 +8,9 @@ use crate::error::CliError;
 /// Arguments of `data merge`.
 #[derive(clap::Args)]
 pub struct Args {
-    /// Output of `data build` or `data generate`, where the manifest goes.
+    /// Output of `data build` or `data generate`; the manifest is written there.
     output: String,
-    /// Further outputs, of the same configuration and input, whose shards are copied there first.
+    /// Other outputs of the same configuration and input; their shards are copied first.
     others: Vec<String>,
 }
 

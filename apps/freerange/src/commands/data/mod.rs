@@ -10,31 +10,31 @@ mod views;
 
 use crate::error::CliError;
 
-/// Make and look at training data.
+/// Build and inspect training data.
 #[derive(clap::Subcommand)]
 pub enum Command {
-    /// Make training objects of mesh files and write them as shards. Run the same command again to go on where it was
-    /// stopped.
-    Build(build::Args),
-    /// Make training objects from nothing and write them as shards.
-    Generate(build::GenerateArgs),
-    /// Join what several processes or machines have built: writes the manifest once all shards are there.
+    /// Build shards of training objects from mesh files.
     ///
-    /// Processes that share one output need no merge: whoever finishes last writes the manifest.
+    /// Run the same command again to continue a stopped build.
+    Build(build::Args),
+    /// Build shards of generated training objects.
+    Generate(build::GenerateArgs),
+    /// Join the outputs of several builds and write the manifest once all shards are present.
+    ///
+    /// Processes that share one output need no merge: the last one writes the manifest.
     Merge(merge::Args),
-    /// Say what shards hold.
+    /// Print the contents of shards.
     Inspect(inspect::Args),
-    /// Say what building many objects will cost, from a few that are made.
+    /// Estimate the cost of many objects from a few.
     ///
     /// `freerange data estimate generated` measures generated objects.
     Estimate(estimate::Args),
-    /// Compare fits of N Gaussians, slices of N from the level-of-detail tree of a larger fit, and points on the surface: PSNR
-    /// in dB on held-out views.
+    /// Compare fits of N Gaussians with slices of the level-of-detail tree and surface points, by held-out PSNR.
     Quality(quality::Args),
-    /// Render a mesh, or each mesh of a folder: posed images as `reconstruct` takes them.
+    /// Render posed images of a mesh, or of each mesh of a folder, for `reconstruct` and `eval`.
     ///
-    /// The mesh is taken to the canonical frame first: +z up, its box centred, within radius 0.5. Where there are enough
-    /// views (20 by default), transforms_full.json, transforms_partial.json and transforms_val.json name those that `eval` uses.
+    /// The mesh is moved to the canonical frame: +z up, its box centered, within radius 0.5. With 20 views or more,
+    /// transforms_full.json, transforms_partial.json and transforms_val.json name the view sets of `eval`.
     Views(views::Args),
     /// Draw a contact sheet of generated objects.
     Gallery(gallery::Args),

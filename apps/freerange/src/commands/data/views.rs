@@ -15,7 +15,7 @@ pub struct Args {
     input: InputArgs,
     #[command(flatten)]
     settings: Settings,
-    /// Where the images go; for a folder of meshes, a folder each therein.
+    /// Output folder; with several meshes, a folder each.
     #[arg(short, long)]
     output: PathBuf,
 }

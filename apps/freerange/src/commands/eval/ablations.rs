@@ -22,19 +22,18 @@ use crate::{error::CliError, ranks::Job};
 pub struct Args {
     #[command(flatten)]
     run: RunArgs,
-    /// Folder of the results: `default` and one folder per setting, each as `freerange eval` writes it, and
-    /// ablations.md and ablations.json.
+    /// Output folder: ablations.md, ablations.json and a folder per setting, as `freerange eval` writes it.
     #[arg(short, long, value_name = "OUT")]
     output: PathBuf,
-    /// What is varied, one setting at a time: guidance, steps, lambda, scale, gradient, inputs [default: those that apply].
+    /// Settings to vary: guidance, steps, lambda, scale, gradient, inputs [default: those that apply].
     ///
-    /// All but inputs are of the flow: they need --init flow, or a model that only samples.
+    /// All but inputs need --init flow, or a model that only samples.
     #[arg(long, value_delimiter = ',', value_name = "SETS", value_parser = set)]
     sets: Option<Vec<Set>>,
     /// Numbers of steps of the set `steps`.
     #[arg(long, value_delimiter = ',', value_name = "NUMBERS", default_value = "5,10,20,50,100")]
     step_counts: Vec<usize>,
-    /// Photometric guidance scales of the set `lambda` [default: a quarter, half, twice and four times the default's].
+    /// Photometric guidance scales of the set `lambda` [default: 1/4, 1/2, 2 and 4 times the default].
     #[arg(long, value_delimiter = ',', value_name = "NUMBERS")]
     lambdas: Option<Vec<f32>>,
     /// Classifier-free guidance scales of the set `scale`.

@@ -26,31 +26,34 @@ const FIT_SIZE: u32 = 128;
 pub struct RunArgs {
     #[command(flatten)]
     pub source: SourceArgs,
-    /// From where the input views look.
+    /// Observation: input views from all around, from one side, or both.
     #[arg(long, value_enum, default_value = "both")]
     pub views: Views,
-    /// Numbers of input views. Four are those that the data names; others are chosen among all views that do not score.
+    /// Numbers of input views.
+    ///
+    /// Four are the sets that the data name. Others are chosen among the views that do not score.
     #[arg(long, value_delimiter = ',', default_value = "4", value_parser = clap::value_parser!(u16).range(2..=64))]
     pub inputs: Vec<u16>,
-    /// What is measured.
+    /// Method that makes the Gaussians.
     #[arg(long, value_enum, default_value = "model")]
     pub method: MethodName,
-    /// With `--method ply`: a folder with NAME.ply for each object, in the frame of its cameras; for the two view sets
-    /// different ones may lie in its folders `full` and `partial`.
+    /// With `--method ply`: folder with NAME.ply of each object, in the frame of its cameras.
+    ///
+    /// Different files for the two view sets may be in its folders `full` and `partial`.
     #[arg(long, value_name = "DIR")]
     pub ply: Option<PathBuf>,
-    /// Iterations of `--method fit`.
+    /// Steps of `--method fit`.
     #[arg(long, default_value_t = FIT_ITERATIONS)]
     pub fit_iterations: usize,
-    /// Longest side, in pixels, of the images that `--method fit` works on.
+    /// Longest side in pixels of the images of `--method fit`.
     #[arg(long, default_value_t = FIT_SIZE)]
     pub fit_size: u32,
     #[command(flatten)]
     pub pipeline: PipelineArgs,
-    /// Samples per object; numbers are means over them, and their disagreement is reported.
+    /// Samples per object; reports have their means and their disagreement.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
     pub samples: u32,
-    /// Metrics to compute; those whose weights are missing are named in the report.
+    /// Metrics; the report names those whose weights are missing.
     #[arg(
         long,
         value_delimiter = ',',
@@ -58,21 +61,21 @@ pub struct RunArgs {
         default_value = "psnr,ssim,ssim-cropped,lpips-vgg,lpips-alex,dino,dreamsim,fid"
     )]
     pub metrics: Vec<Metric>,
-    /// Folder of the metrics' weights; else where `freerange weights fetch` puts them.
+    /// Folder of the metrics' weights [default: that of `freerange weights fetch`].
     #[arg(long, value_name = "DIR")]
     pub weights: Option<PathBuf>,
     /// Weights of the DINO similarity: dinov2-small, dinov2-base or dinov2-large.
     #[arg(long, value_name = "NAME", default_value = "dinov2-base")]
     pub dino: String,
-    /// Throw away what an earlier run has left in the output folder.
+    /// Delete an earlier run's results in the output folder.
     #[arg(long)]
     pub overwrite: bool,
-    /// Picture strips: none, or one per object, with those of the worst and best objects or of all of them within
-    /// report.html.
+    /// Image strips of objects: none, or one each, with the extremes or all in report.html.
     #[arg(long, value_enum, default_value = "extremes")]
     pub pictures: Pictures,
-    /// Work on part I of N only (from 0) and write no report: several processes or devices can fill one folder. Run once
-    /// more without it at the end.
+    /// Measure only part I of N of the objects, I from 0 to N - 1, and write no report.
+    ///
+    /// Several processes can fill one folder. Run the command without it at the end.
     #[arg(long, value_name = "I/N")]
     pub shard: Option<Share>,
 }
@@ -84,7 +87,7 @@ pub enum Views {
     Full,
     /// All from one side.
     Partial,
-    /// One after the other.
+    /// Both.
     Both,
 }
 
@@ -104,9 +107,9 @@ impl Views {
 pub enum Pictures {
     /// None.
     None,
-    /// One per object; those of the worst and the best ones within report.html.
+    /// One per object; the worst and best ones in report.html.
     Extremes,
-    /// One per object, all of them within report.html.
+    /// One per object, all in report.html.
     All,
 }
 

@@ -12,9 +12,9 @@ use crate::error::CliError;
 /// Arguments of `eval compare`.
 #[derive(clap::Args)]
 pub struct Args {
-    /// A run's folder or its report.json.
+    /// Output folder of `freerange eval`, or its report.json.
     a: PathBuf,
-    /// Another one, of the same objects and validation images.
+    /// Another one of the same objects and validation images.
     b: PathBuf,
     /// Seed of the bootstrap.
     #[arg(long, default_value_t = 0)]

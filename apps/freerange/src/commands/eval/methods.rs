@@ -22,13 +22,13 @@ use crate::error::CliError;
 pub enum MethodName {
     /// The model.
     Model,
-    /// The model's pipeline with the network left out: initial fits are not refined by it.
+    /// The same pipeline without the network: initial fits, then the optimization.
     Start,
-    /// 3DGS-MCMC on the input views alone, without a model.
+    /// 3DGS-MCMC on the input views alone.
     Fit,
-    /// No Gaussians at all: a white image.
+    /// No Gaussians: a white image.
     White,
-    /// Gaussians that any other program made: see --ply.
+    /// Gaussians of any program: see --ply.
     Ply,
 }
 

@@ -27,7 +27,7 @@ pub struct Args {
     command: Option<Command>,
     #[command(flatten)]
     run: RunArgs,
-    /// Folder of the results; needed unless --json asks for the report alone.
+    /// Output folder; needed unless --json prints the report alone.
     #[arg(short, long, value_name = "OUT")]
     output: Option<PathBuf>,
     /// Print the report as JSON on standard output.
@@ -39,9 +39,9 @@ pub struct Args {
 enum Command {
     /// Compare two reports of the same data object by object.
     Compare(compare::Args),
-    /// Measure what each setting of sampling is worth, on one checkpoint and one source of objects.
+    /// Measure one changed setting of the pipeline after the other, on the same objects.
     Ablations(Box<ablations::Args>),
-    /// Write the paper's four tables, its numbers beside those of rows that were trained and evaluated here.
+    /// Write the paper's four tables with its numbers beside those measured here.
     PaperTables(Box<paper_tables::Args>),
 }
 

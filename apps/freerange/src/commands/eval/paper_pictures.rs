@@ -28,8 +28,9 @@ const INPUTS: usize = 4;
 /// Arguments for pictures.
 #[derive(clap::Args)]
 pub struct PictureArgs {
-    /// Write a picture: for each object its inputs, the true view from behind, and that of each row; below, its Gaussians,
-    /// shrunk and in random colors. Needs --runs and a source of objects.
+    /// Write an image of each object's inputs, true view and rows. Needs --runs and a source of objects.
+    ///
+    /// Below each row are its Gaussians, shrunk and in random colors.
     #[arg(long, value_name = "PNG", requires = "runs")]
     picture: Option<PathBuf>,
     /// Folder of the rows' training runs, for --picture.

@@ -11,12 +11,12 @@ use crate::error::CliError;
 /// Arguments of `eval paper-tables`.
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folder with a folder of evaluations for each row, as `tools/tables.sh` makes it.
+    /// Folder of the rows' evaluations, as `tools/tables.sh` makes it.
     rows: PathBuf,
     /// Write the tables to this Markdown file instead of standard output.
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// Also write what the tables are made of, without single views, to this folder: it takes the place of ROWS later.
+    /// Also write the tables' data to this folder, which can replace ROWS later.
     #[arg(long, value_name = "DIR")]
     keep: Option<PathBuf>,
     /// Seed of the bootstrap.

@@ -27,40 +27,40 @@ use crate::{
 /// Where the objects come from: one of `--scenes`, `--data`, `--generated`.
 #[derive(clap::Args)]
 pub struct SourceArgs {
-    /// A folder of scene folders, or one scene folder: posed images with view sets as `freerange data views` writes them.
+    /// Folder of scene folders, or one scene folder, as `freerange data views` writes them.
     #[arg(long, value_name = "DIR", group = "source")]
     scenes: Option<PathBuf>,
-    /// Objects of shards: a folder or URL.
+    /// Folder or URL of shards.
     #[arg(long, value_name = "LOCATION", group = "source")]
     data: Option<String>,
-    /// So many objects made on the fly, which no training has seen.
+    /// Number of generated objects, which no training has seen.
     #[arg(long, value_name = "N", group = "source")]
     generated: Option<u64>,
-    /// File with the input views around the object, within each scene folder.
+    /// File of a scene with the input views from all around.
     #[arg(long, value_name = "FILE", default_value = "transforms_full.json")]
     full_file: String,
-    /// File with the input views from one side, within each scene folder.
+    /// File of a scene with the input views from one side.
     #[arg(long, value_name = "FILE", default_value = "transforms_partial.json")]
     partial_file: String,
-    /// File with the validation views, within each scene folder.
+    /// File of a scene with the validation views.
     #[arg(long, value_name = "FILE", default_value = "transforms_val.json")]
     validation_file: String,
-    /// True meshes of the scenes, NAME.glb for each scene folder: adds the distance from the result's surface to them.
+    /// Folder with the true mesh of each scene, NAME.glb: adds metrics of geometry.
     #[arg(long, value_name = "DIR", requires = "scenes")]
     meshes: Option<PathBuf>,
-    /// Part of the shards' objects.
+    /// Split of the shards.
     #[arg(long, value_enum, default_value = "test")]
     split: SplitName,
-    /// Seed of the first generated object. The default is far from those that training and `data generate` begin with.
+    /// Seed of the first generated object; the default is beyond the seeds of training data.
     #[arg(long, default_value_t = 7_000_000_000_000)]
     first_seed: u64,
-    /// Configuration whose generator, cameras and number of views generated objects have: a file, or tiny, base, paper.
+    /// Configuration of generated objects (generator, cameras, views): tiny, base, paper, or a file.
     #[arg(long, default_value = "tiny")]
     config: PathBuf,
     /// Width and height of the views of generated objects in pixels [default: the configuration's].
     #[arg(long, value_name = "PIXELS", value_parser = clap::value_parser!(u32).range(16..=2048))]
     generated_size: Option<u32>,
-    /// Take the first N objects only.
+    /// Measure the first N objects only.
     #[arg(long, value_name = "N")]
     limit: Option<usize>,
 }

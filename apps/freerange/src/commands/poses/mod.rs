@@ -23,31 +23,31 @@ const MANY: usize = 16;
 /// Photos on either side that are compared first, as a share of all: those within 60 degrees of one turn.
 const NEIGHBORS: f64 = 1.0 / 6.0;
 
-/// Find the cameras of photos that have none, with COLMAP or pycolmap, and judge them.
+/// Find the cameras of photos that have none with COLMAP or pycolmap, and check them.
 ///
-/// Photos go once around the object, in the order of their names. Writes a scene that `reconstruct` takes: images/, sparse/0, poses.json (what
-/// was found and how it was judged) and poses.log (what the engine said). Poses that look wrong are refused with exit code 2; poses.json and
-/// poses.log are written all the same.
+/// The photos go once around the object, in the order of their names. Writes a scene for `reconstruct`: images/, sparse/0, poses.json
+/// (poses and checks) and poses.log (output of COLMAP). Poses that look wrong are refused with exit code 2; poses.json and poses.log are
+/// still written.
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder of photos.
     photos: PathBuf,
-    /// Where the scene goes.
+    /// Output folder of the scene.
     #[arg(short, long)]
     output: PathBuf,
-    /// A Python that has pycolmap [default: COLMAP on the PATH, else python3].
+    /// Python with pycolmap [default: COLMAP on the PATH, else python3].
     #[arg(long, value_name = "PROGRAM")]
     python: Option<PathBuf>,
-    /// The photos are not at even steps once around: uneven steps are told of, not refused.
+    /// The photos are not at even steps: warn of uneven steps instead of refusing them.
     #[arg(long)]
     uneven: bool,
-    /// A folder of masks (NAME.jpg.png or NAME.png; black is passed over), for objects on a turntable.
+    /// Folder of masks (NAME.jpg.png or NAME.png, black is ignored), for objects on a turntable.
     #[arg(long, value_name = "FOLDER")]
     masks: Option<PathBuf>,
     /// Seed of the engine's random numbers.
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Print what was found as JSON.
+    /// Print the report as JSON.
     #[arg(long)]
     json: bool,
 }
