@@ -16,7 +16,7 @@ use super::{
     symmetry::Targets,
     watch::{Watch, flow},
 };
-use crate::{Error, Init, Options, Reconstructor, Stage, progress::Preview};
+use crate::{Error, Init, Options, Reconstructor, Stage, error::Lift, progress::Preview};
 
 /// Numbers that one seed has for its proposals: as many as `propose.count` allows.
 const MOST: u64 = 64;
@@ -87,5 +87,5 @@ fn fits(
         flow(&stopped)
     });
     stopped?;
-    fits.into_iter().collect::<Result<_, _>>().lift()
+    fits.into_iter().map(Lift::lift).collect()
 }

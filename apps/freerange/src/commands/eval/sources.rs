@@ -5,7 +5,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use freerange::{Scene, View};
+use freerange::{Scene, Up, View};
 use freerange_build::{BuildConfig, Item, Items, render_views, true_mesh};
 use freerange_core::{Note, NoteKind};
 use freerange_data::{ObjectSource, Shards, Split, Store};
@@ -221,7 +221,8 @@ fn load_scene(name: &str, folder: &Path, [full, partial, validation]: &[String; 
         }
         let mut cameras = cameras_with(&path, &ReadConfig::default())?;
         cameras.subtract(*origin.get_or_insert(cameras.origin));
-        let scene = Scene::load(cameras, &SceneConfig::default())?;
+        // Up is for the method to say.
+        let scene = Scene::load(cameras, &SceneConfig { up: Some(Up::Z), ..SceneConfig::default() })?;
         whole(&path, &scene.notes)?;
         Ok(scene.loaded.views.into_iter().chain(scene.loaded.further).collect())
     };
