@@ -20,8 +20,8 @@ use signals::{EXIT_CODE, Signals};
 
 /// Posed photos in, 3D Gaussians out.
 ///
-/// Reconstructs one object from as few as four photos with cameras: initial fits, a network that refines them, and an
-/// optimization on the photos. Exit codes: 0 done, 1 failed, 2 bad input.
+/// Reconstructs one object from as few as four photos with cameras. A network refines initial fits, then an optimization on
+/// the photos follows. Exit codes: 0 done, 1 failed, 2 bad input.
 #[derive(Parser)]
 #[command(name = "freerange", version, max_term_width = 100)]
 struct Cli {
@@ -34,17 +34,11 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Reconstruct an object from posed images.
     Reconstruct(Box<commands::reconstruct::Args>),
-    /// Check a scene before reconstruction: cameras, masks, place, size and warnings.
     Inspect(commands::inspect::Args),
-    /// Find the cameras of photos that have none.
     Poses(commands::poses::Args),
-    /// Serve a web page: drop photos with cameras, correct masks, watch the Gaussians appear.
     Serve(Box<commands::serve::Args>),
-    /// Render Gaussians from given cameras.
     Render(commands::render::Args),
-    /// Convert Gaussians between file formats, into a mesh, or into a page that shows them.
     Convert(commands::convert::Args),
     /// Measure a method on objects with validation views; compare reports; ablations.
     ///
@@ -55,14 +49,11 @@ enum Command {
     /// List and download the published weights of metrics.
     #[command(subcommand)]
     Weights(commands::weights::Command),
-    /// Train a model.
     Train(commands::train::Args),
     /// Build and inspect training data.
     #[command(subcommand)]
     Data(commands::data::Command),
-    /// Benchmark kernels and whole steps on a device.
     Bench(commands::bench::Args),
-    /// List the devices that this program can compute on.
     Devices(commands::devices::Args),
     /// Inspect, shrink, average and export models.
     #[command(subcommand)]

@@ -35,6 +35,12 @@ fn arguments(command: &Command) -> impl Iterator<Item = &Arg> {
 /// The whole help of an argument, and what it says of the default.
 fn help(arg: &Arg) -> (String, Option<String>) {
     let text = arg.get_long_help().or(arg.get_help()).map(ToString::to_string).unwrap_or_default();
+    // One paragraph loses its last point to clap.
+    let points = |paragraph: &str| match paragraph.trim_end() {
+        done if done.is_empty() || done.ends_with(['.', ')', ']', ':', '!']) => done.to_owned(),
+        open => format!("{open}."),
+    };
+    let text = text.split("\n\n").map(points).collect::<Vec<_>>().join(" ");
     let text = text.split_whitespace().collect::<Vec<_>>().join(" ");
     match text.split_once("[default: ").and_then(|(before, rest)| Some((before, rest.split_once(']')?))) {
         Some((before, (default, after))) => (format!("{}{after}", before.trim_end()), Some(default.into())),
@@ -199,11 +205,17 @@ fn calls(line: &str) -> Vec<Vec<String>> {
     let mut found = Vec::new();
     for command in line.split(&[';', '|', '&'][..]).flat_map(|part| part.split("$(")) {
         let words = shell_words(command.trim().trim_start_matches("$ "));
-        let program = words.iter().position(|w| w == "freerange" || w.ends_with("/freerange"));
         // A program that is called, not a package, an image or a folder of that name: what stands before starts it.
-        let starters = ["mpirun", "srun", "time", "env", "nice", "sudo"];
-        let starts = |w: &String| w.contains('=') || starters.contains(&w.as_str());
-        if let Some(at) = program.filter(|at| *at == 0 || starts(&words[0])) {
+        let starters = ["mpirun", "srun", "time", "env", "nice"];
+        let first = words.iter().position(|w| !w.contains('=')).unwrap_or(words.len());
+        let ours = |w: &String| w == "freerange" || w.ends_with("/freerange");
+        let program = match words.get(first) {
+            Some(w) if ours(w) => Some(first),
+            Some(w) if starters.contains(&w.as_str()) => words.iter().position(ours),
+            _ => None,
+        };
+        // What a shell puts in place of variables is not known here.
+        if let Some(at) = program.filter(|at| !words[*at..].iter().any(|w| w.contains('$'))) {
             found.push(words[at + 1..].iter().map(|w| w.trim_end_matches(')').to_owned()).collect());
         }
     }
@@ -262,6 +274,7 @@ const OTHERS: &[&str] = &[
     "--git",
     "--ignored",
     // git, docker, MPI, COLMAP, pip
+    "--build-arg",
     "--depth",
     "--rm",
     "--gpus",
@@ -307,5 +320,6 @@ fn lines_of_a_shell_are_understood() {
         [vec!["train", "a.toml"], vec!["eval"]]
     );
     assert_eq!(calls("X=1 target/release/freerange devices > file"), [vec!["devices"]]);
-    assert!(calls("docker run freerange reconstruct").is_empty() && calls("cargo install freerange").is_empty());
+    assert!(calls("docker run freerange reconstruct").is_empty() && calls("X=1 a.sh b/freerange c").is_empty());
+    assert!(calls("freerange eval --shard $I/4").is_empty());
 }

@@ -24,8 +24,8 @@ pub struct Args {
     files: Vec<PathBuf>,
     /// Frame of formats that define none: z-up (this program), y-up or y-down [default: z-up, or what a .ply says].
     ///
-    /// Most programs that train on COLMAP's cameras are y-down. FROM:TO turns: FROM is the frame of the input, whatever its format
-    /// says (many .spz are y-down), TO that of the output.
+    /// Most programs that train on COLMAP's cameras are y-down. FROM:TO turns from the frame of the input to that of
+    /// the output. FROM overrides what a format says; many .spz are y-down.
     #[arg(long, value_name = "FRAME")]
     frame: Option<Frames>,
     /// Version of .spz to write: 3, 4 (newer readers) or 2 (oldest readers, rotations off by up to 10 degrees).
