@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use freerange_formats::{Format, Frame, WriteOptions, encode, parse};
+use freerange_gaussians::formats::{Format, Frame, WriteOptions, encode, parse};
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|data: &[u8]| {

@@ -1,7 +1,7 @@
 //! Any bytes as a mesh file: an error, or a mesh that is valid and within its limits.
 #![no_main]
 
-use freerange_mesh::{LoadLimits, MeshFormat, load_mesh_bytes};
+use freerange_assets::mesh::{LoadLimits, MeshFormat, load_mesh_bytes};
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|data: &[u8]| {

@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use freerange_camera::scene::Description;
+use freerange_scene::camera::scene::Description;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|data: &[u8]| {

@@ -1,7 +1,7 @@
 //! What comes from Python.
 
 use freerange::{Camera, Choices, Options, Reconstructor, Up, View};
-use freerange_camera::scene::nearest_rotation;
+use freerange_scene::camera::scene::nearest_rotation;
 use glam::{DMat3, DMat4, DVec3};
 use image::RgbaImage;
 use pyo3::{exceptions::PyValueError, prelude::*, pybacked::PyBackedBytes};

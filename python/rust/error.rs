@@ -2,7 +2,7 @@
 
 use std::error::Error;
 
-use freerange_hub::HubError;
+use freerange_model::hub::HubError;
 use freerange_raster::RasterError;
 use pyo3::{
     PyErr,

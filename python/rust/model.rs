@@ -11,7 +11,7 @@ use freerange::{
     DeviceName, EncoderPlaces, FrameConfig, Hints, Options, Reconstructor, View, cut_out, internal::shipped,
     machine::cache_folder,
 };
-use freerange_hub::Hub;
+use freerange_model::hub::Hub;
 use glam::DVec3;
 use pyo3::{prelude::*, types::PyByteArray};
 

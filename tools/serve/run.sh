@@ -30,7 +30,7 @@ npx tsc -p tsconfig.viewer.json
 # ESLint does not look above its own folder.
 trap 'rm -rf linted' EXIT
 mkdir -p linted
-cp ../../crates/freerange-serve/src/page/page.js ../../crates/freerange-formats/src/viewer/viewer.js linted/
+cp ../../crates/product/freerange-serve/src/page/page.js ../../crates/base/freerange-gaussians/src/formats/viewer/viewer.js linted/
 npx eslint linted check.mjs
 options=()
 node -e 'process.exit(typeof WebSocket === "undefined" ? 1 : 0)' || options+=(--experimental-websocket)

@@ -2,11 +2,12 @@
 
 use std::{error::Error, fmt, path::Path};
 
-use freerange_build::BuildError;
-use freerange_core::system_failed;
 use freerange_data::DataError;
-use freerange_fit::FitError;
-use freerange_flow::FlowError;
+use freerange_data::build::BuildError;
+use freerange_diffusion::FlowError;
+use freerange_optim::FitError;
+use freerange_train::TrainError;
+use freerange_util::system_failed;
 
 /// Why a command ended without its result.
 #[derive(Debug)]
@@ -84,17 +85,27 @@ fn code_of(error: &(dyn Error + 'static)) -> u8 {
     if system_failed(error) { 1 } else { 2 }
 }
 
+impl From<TrainError> for CliError {
+    fn from(e: TrainError) -> Self {
+        match e {
+            TrainError::Data(e) => e.into(),
+            TrainError::Fit(e) => e.into(),
+            TrainError::Flow(e) => e.into(),
+            TrainError::NotFinite { .. }
+            | TrainError::Device { .. }
+            | TrainError::Cancelled
+            | TrainError::Ranks { .. }
+            | TrainError::Elsewhere { .. } => Self::failure(e),
+            _ => Self { code: code_of(&e), source: e.into(), agreed: false },
+        }
+    }
+}
+
 impl From<FlowError> for CliError {
     fn from(e: FlowError) -> Self {
         match e {
-            FlowError::Data(e) => e.into(),
             FlowError::Fit(e) => e.into(),
-            FlowError::NotFinite { .. }
-            | FlowError::NoGradient
-            | FlowError::Device { .. }
-            | FlowError::Cancelled
-            | FlowError::Ranks { .. }
-            | FlowError::Elsewhere { .. } => Self::failure(e),
+            FlowError::NoGradient | FlowError::Device { .. } | FlowError::Cancelled => Self::failure(e),
             _ => Self { code: code_of(&e), source: e.into(), agreed: false },
         }
     }
@@ -149,24 +160,24 @@ macro_rules! other_errors {
     )*};
 }
 other_errors!(
-    freerange_camera::CameraError,
+    freerange_scene::camera::CameraError,
     freerange_eval::EvalError,
-    freerange_formats::FormatError,
-    freerange_hub::HubError,
-    freerange_mesh::MeshError,
-    freerange_metrics::MetricsError,
+    freerange_gaussians::formats::FormatError,
+    freerange_model::hub::HubError,
+    freerange_assets::mesh::MeshError,
+    freerange_eval::metrics::MetricsError,
     freerange_model::ModelError,
     freerange_raster::RasterError,
     freerange_scene::SceneError,
-    freerange_splat::SplatError,
-    freerange_surface::SurfaceError
+    freerange_gaussians::SplatError,
+    freerange_optim::meshing::SurfaceError
 );
 
 #[cfg(test)]
 mod tests {
     use std::io;
 
-    use freerange_core::IoError;
+    use freerange_util::IoError;
 
     use super::*;
 
@@ -179,19 +190,19 @@ mod tests {
         let diverged = || FitError::Diverged { step: 3, what: "the loss" };
         let input: [CliError; 4] = [
             data(io::ErrorKind::NotFound).into(),
-            FlowError::Data(data(io::ErrorKind::PermissionDenied)).into(),
+            TrainError::Data(data(io::ErrorKind::PermissionDenied)).into(),
             FitError::NoViews.into(),
             CliError::file(Path::new("a"), "expected a folder"),
         ];
         assert_eq!(input.map(|e| e.exit_code()), [2; 4]);
         let failures: [CliError; 9] = [
-            FlowError::Device { problem: "lost".into() }.into(),
+            TrainError::Device { problem: "lost".into() }.into(),
             data(io::ErrorKind::StorageFull).into(),
-            FlowError::Data(data(io::ErrorKind::ConnectionReset)).into(),
+            TrainError::Data(data(io::ErrorKind::ConnectionReset)).into(),
             CliError::file(Path::new("a"), io::Error::from(io::ErrorKind::StorageFull)),
             CliError::file(Path::new("a"), image::ImageError::IoError(io::ErrorKind::StorageFull.into())),
             diverged().into(),
-            FlowError::Data(DataError::from_source(BuildError::Fit(diverged()))).into(),
+            TrainError::Data(DataError::from_source(BuildError::Fit(diverged()))).into(),
             DataError::Worker { index: 1 }.into(),
             FlowError::NoGradient.into(),
         ];
@@ -204,7 +215,7 @@ mod tests {
         assert_eq!(found, format!("shards/a.tar: {}", io::Error::from(io::ErrorKind::NotFound)));
         // An error that does not say why.
         let source = serde_json::from_str::<()>("{").unwrap_err();
-        let error = freerange_camera::CameraError::Json { file: "a.json".into(), source };
+        let error = freerange_scene::camera::CameraError::Json { file: "a.json".into(), source };
         assert_eq!(CliError::from(error).to_string().matches("because: ").count(), 1);
     }
 }

@@ -8,7 +8,7 @@ use std::{
     sync::{Mutex, MutexGuard, PoisonError},
 };
 
-use freerange_core::write_atomically;
+use freerange_util::write_atomically;
 
 use crate::error::CliError;
 

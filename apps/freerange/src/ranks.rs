@@ -4,8 +4,8 @@
 use std::{collections::BTreeMap, env, rc::Rc};
 
 use freerange::{Device, DeviceName};
-use freerange_flow::{
-    FlowError,
+use freerange_train::{
+    TrainError,
     ranks::{Ranks, Single, gather},
 };
 
@@ -106,10 +106,10 @@ impl Job {
             Sums::Host => Ok(self.ranks.clone()),
             #[cfg(feature = "nccl")]
             Sums::Nccl => self.together(
-                freerange_nccl::Nccl::join(self.ranks.clone(), device)
+                freerange_ranks::Nccl::join(self.ranks.clone(), device)
                     .map(|nccl| Rc::new(nccl) as Rc<dyn Ranks>)
                     .map_err(|e| match e {
-                        FlowError::Ranks { problem } => CliError::input(problem),
+                        TrainError::Ranks { problem } => CliError::input(problem),
                         other => other.into(),
                     }),
             ),
@@ -264,7 +264,7 @@ fn launched(variable: impl Fn(&str) -> Option<String>) -> Option<Launched> {
 /// The ranks that MPI finds; none where this process is alone.
 #[cfg(feature = "mpi")]
 fn connect(launched: &Launched) -> Result<Option<Rc<dyn Ranks>>, CliError> {
-    use freerange_mpi::Mpi;
+    use freerange_ranks::Mpi;
     if !launched.mpi {
         return Err(CliError::input(format!(
             "{} started {} processes without MPI: expected `srun --mpi=pmix` or `--mpi=pmi2`, as the MPI library was built \
@@ -304,7 +304,7 @@ fn connect(launched: &Launched) -> Result<Option<Rc<dyn Ranks>>, CliError> {
 impl CliError {
     /// Whether another rank has the reason.
     fn is_elsewhere(&self) -> bool {
-        matches!(self.cause().downcast_ref(), Some(FlowError::Elsewhere { .. }))
+        matches!(self.cause().downcast_ref(), Some(TrainError::Elsewhere { .. }))
     }
 }
 

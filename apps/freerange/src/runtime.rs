@@ -3,12 +3,12 @@
 use std::{borrow::Cow, path::Path};
 
 use freerange::machine::cache_folder;
-use freerange_build::{BuildConfig, MakingConfig};
+use freerange_data::build::{BuildConfig, MakingConfig};
 
 use crate::{error::CliError, progress::Progress};
 
-/// A configuration file: training, and how `freerange-build` makes objects for it.
-pub type TrainConfig = freerange_flow::config::TrainConfig<MakingConfig>;
+/// A configuration file: training, and how `freerange-data` makes objects for it.
+pub type TrainConfig = freerange_train::config::TrainConfig<MakingConfig>;
 
 /// How shards for a training are made.
 pub fn build_config(config: &TrainConfig) -> BuildConfig {
@@ -30,7 +30,7 @@ pub fn local(path: &Path) -> Result<Cow<'_, Path>, CliError> {
         return Err(CliError::input(format!("{name}: no cache folder is known on this system: expected a file")));
     };
     let mut bar = None;
-    let pinned = freerange_hub::Hub::new(cache).files(&name.parse()?, &[WEIGHTS], &mut |file, done, size| {
+    let pinned = freerange_model::hub::Hub::new(cache).files(&name.parse()?, &[WEIGHTS], &mut |file, done, size| {
         bar.get_or_insert_with(|| Progress::new(name, size)).at(done, file);
     })?;
     bar.into_iter().for_each(|bar| bar.finish());

@@ -6,7 +6,7 @@ use std::{
     process::{Command, Output},
 };
 
-use freerange_camera::{Camera, View};
+use freerange_scene::camera::{Camera, View};
 use glam::{DMat4, DVec3};
 use image::{Rgba, RgbaImage};
 use serde_json::Value;

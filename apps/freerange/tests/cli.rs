@@ -121,8 +121,8 @@ fn reconstruct_writes_everything_and_its_cloud_can_be_rendered_from_the_users_ca
         let render = image::open(renders.join(format!("{name}.png"))).unwrap().to_rgba8();
         let folder = scene.join("test");
         let truth = image::open(folder.join(format!("{name}.png"))).unwrap().to_rgba8();
-        let to_floats = |i: &image::RgbaImage| freerange_camera::image_ops::composite(i, [1.0; 3]);
-        let psnr = freerange_metrics::psnr(&to_floats(&render), &to_floats(&truth)).unwrap();
+        let to_floats = |i: &image::RgbaImage| freerange_scene::camera::image_ops::composite(i, [1.0; 3]);
+        let psnr = freerange_raster::metrics::psnr(&to_floats(&render), &to_floats(&truth)).unwrap();
         assert!((psnr - view["psnr"].as_f64().unwrap()).abs() < 0.05, "{name}: {psnr} against {}", view["psnr"]);
     }
 }

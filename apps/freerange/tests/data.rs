@@ -151,10 +151,10 @@ fn meshes_become_shards_views_and_figures() {
     let (scene, one) = (path("scene"), path("meshes/a.obj"));
     said(&["data", "views", &one, "-o", &scene, "--views", "24", "--resolution", "40"]);
     for (file, views) in [("transforms.json", 24), ("transforms_full.json", 4), ("transforms_val.json", 12)] {
-        let loaded = freerange_camera::load_cameras(&folder.path().join("scene").join(file)).unwrap();
+        let loaded = freerange_scene::camera::load_cameras(&folder.path().join("scene").join(file)).unwrap();
         assert_eq!(loaded.len(), views, "{file}");
     }
-    let loaded = freerange_camera::Scene::load(&folder.path().join("scene/transforms_full.json")).unwrap();
+    let loaded = freerange_scene::camera::Scene::load(&folder.path().join("scene/transforms_full.json")).unwrap();
     assert!(loaded.inputs.iter().all(|v| v.image.pixels().any(|p| p.0[3] == 255)));
 
     let cost = said(&with(&["data", "estimate", &meshes, "--objects", "140000", "--json"], &FAST));

@@ -6,9 +6,9 @@ use std::{
     process::{Command, Output},
 };
 
-use freerange_camera::{Camera, image_ops::composite, transforms_json};
+use freerange_gaussians::{Cloud, write_ply};
 use freerange_raster::{RasterConfig, render};
-use freerange_splat::{Cloud, write_ply};
+use freerange_scene::camera::{Camera, image_ops::composite, transforms_json};
 use glam::DVec3;
 use image::{Rgba, RgbaImage};
 use serde_json::Value;

@@ -6,8 +6,8 @@ use std::{
     process::{Command, Output},
 };
 
-use freerange_formats::{Frame, read};
-use freerange_splat::{Cloud, channel, write_ply};
+use freerange_gaussians::formats::{Frame, read};
+use freerange_gaussians::{Cloud, channel, write_ply};
 use glam::DVec3;
 
 fn freerange(args: &[&str]) -> Output {
@@ -182,9 +182,9 @@ fn reconstruct_writes_the_formats_asked_for() {
         assert!(found.len() == cloud.len() && apart < 1e-4, "{name}: {apart}");
     }
     // A mesh, in two formats.
-    let limits = freerange_mesh::LoadLimits::default();
-    let meshes =
-        ["mesh.glb", "mesh.obj"].map(|name| freerange_mesh::load_mesh(&output.join(name), &limits).unwrap().mesh);
+    let limits = freerange_assets::mesh::LoadLimits::default();
+    let meshes = ["mesh.glb", "mesh.obj"]
+        .map(|name| freerange_assets::mesh::load_mesh(&output.join(name), &limits).unwrap().mesh);
     assert!(meshes[0].triangles.len() > 1000 && meshes[0].triangles.len() == meshes[1].triangles.len());
     assert!(!meshes[0].colors.is_empty());
     // All formats can be rendered.

@@ -2,9 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-use freerange_formats::{Format, Frame, Frames, SpzVersion, WriteOptions, read, write};
-use freerange_splat::Splats;
-use freerange_surface::{MeshConfig, MeshFormat, mesh_of, save};
+use freerange_gaussians::Splats;
+use freerange_gaussians::formats::{Format, Frame, Frames, SpzVersion, WriteOptions, read, write};
+use freerange_optim::meshing::{MeshConfig, MeshFormat, mesh_of, save};
 use glam::{DQuat, DVec3};
 
 use crate::error::CliError;

@@ -7,7 +7,7 @@ use freerange::{
     internal::{Settings, checkpoint_header},
     to_canonical,
 };
-use freerange_camera::transforms_json;
+use freerange_scene::camera::transforms_json;
 use freerange_scene::{
     inspect::{Inspection, inspect, sheet},
     write_masks,

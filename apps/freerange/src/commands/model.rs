@@ -90,7 +90,7 @@ pub fn run(command: &Command) -> Result<(), CliError> {
                 Ok((path.clone(), checkpoint))
             };
             let all = args.inputs.iter().map(load).collect::<Result<Vec<_>, CliError>>()?;
-            Ok(freerange_flow::average(all)?.save(&args.output)?)
+            Ok(freerange_train::average(all)?.save(&args.output)?)
         }
         Command::Shrink(args) => {
             let encoders = EncoderPlaces::at(args.encoder_weights.clone());

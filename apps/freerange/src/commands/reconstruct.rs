@@ -14,16 +14,16 @@ use freerange::{
     pictures::{on_white, render_view, write_turntable},
     read_gaussians, score,
 };
-use freerange_camera::{
+use freerange_eval::memory::peak_memory;
+use freerange_gaussians::formats::{Format, Frame, WriteOptions};
+use freerange_gaussians::{Splats, write_ply_at};
+use freerange_optim::meshing::{MeshConfig, MeshFormat, mesh_of, save};
+use freerange_scene::camera::{
     FrameConfig, canonical_from_user,
     image_ops::{sheet, to_picture},
 };
-use freerange_core::{Note, NoteKind};
-use freerange_eval::memory::peak_memory;
-use freerange_formats::{Format, Frame, WriteOptions};
 use freerange_scene::{views_to_compare, write_colmap};
-use freerange_splat::{Splats, write_ply_at};
-use freerange_surface::{MeshConfig, MeshFormat, mesh_of, save};
+use freerange_util::{Note, NoteKind};
 use serde::Serialize;
 
 use crate::{
@@ -359,7 +359,7 @@ fn reconstruct(
             let name = if *format == Format::Html { "view" } else { "gaussians" };
             let options = WriteOptions { frame, ..WriteOptions::default() };
             let path = output.path(&format!("{name}{suffix}.{format}"))?;
-            let lost = freerange_formats::write(&splats, &path, &options)?;
+            let lost = freerange_gaussians::formats::write(&splats, &path, &options)?;
             notes.extend(lost.into_iter().map(|note| Note::dropped(format!("{name}{suffix}.{format}: {note}"))));
         }
         write_turntable(&output.path(&format!("turntable{suffix}.gif"))?, &sample.canonical, 48, 256)?;

@@ -3,9 +3,9 @@
 use std::path::PathBuf;
 
 use freerange::pictures::render_splats;
-use freerange_camera::{image_ops::to_picture, load_cameras};
-use freerange_formats::{Format, Frames, Loaded, read};
-use freerange_splat::RenderMode;
+use freerange_gaussians::RenderMode;
+use freerange_gaussians::formats::{Format, Frames, Loaded, read};
+use freerange_scene::camera::{image_ops::to_picture, load_cameras};
 
 use crate::{error::CliError, output::OutputFolder, progress::Progress};
 

@@ -6,12 +6,12 @@ use freerange::{
     Camera, Cloud, Detect, Init, Quality, Reconstructor, View, choose_views, internal::others_show,
     pictures::render_view,
 };
-use freerange_camera::image_ops::to_picture;
-use freerange_core::IoError;
+use freerange_scene::camera::image_ops::to_picture;
 use freerange_scene::estimate::OthersShow;
 use freerange_serve::{
     Engine, EngineError, Example, JobOptions, Limits, Outcome, Scene, ServeConfig, ServeError, Server, Step,
 };
+use freerange_util::IoError;
 use image::RgbaImage;
 
 use crate::{error::CliError, pipeline::PipelineArgs, ranks::Job, signals::Signals};

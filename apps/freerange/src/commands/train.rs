@@ -15,12 +15,12 @@ use freerange::{
     DeviceName, EncoderPlaces,
     internal::{checkpoint_sha256, encoder_for_training, load_checkpoint, tensor_device},
 };
-use freerange_core::sha256_of;
-use freerange_flow::{
-    FlowError,
+use freerange_train::{
+    TrainError,
     batch::step_rng,
     trainer::{Among, Initial, Trainer},
 };
+use freerange_util::sha256_of;
 
 use freerange_model::{Compute, Execution, FreeRange, ModelConfig, ModelInfo, Workload};
 
@@ -136,7 +136,7 @@ fn train(args: &Args, job: &Job, interrupt: &Arc<Interrupt>, begin: Instant) -> 
     let mut run = Run::new(&mut trainer, journal, interrupt, args.save_every);
     match run.go_on() {
         // The others cannot be heard any more.
-        Err(e @ FlowError::Ranks { .. }) => return Err(e.into()),
+        Err(e @ TrainError::Ranks { .. }) => return Err(e.into()),
         ended => job.together(ended.map_err(CliError::from))?,
     }
     run.finish();

@@ -73,12 +73,12 @@ pub fn run(command: &Command) -> Result<(), CliError> {
 
 #[cfg(feature = "networks")]
 fn list(args: &List) -> Result<(), CliError> {
-    use freerange_metrics::weights::{SETS, Weights};
+    use freerange_eval::metrics::weights::{SETS, Weights};
     let folder = args.weights.folder()?;
     let weights = Weights::new([folder.clone()]);
     let there: Vec<bool> = SETS.iter().map(|set| weights.find(set.name).is_ok()).collect();
     if args.json {
-        let entry = |(set, there): (&freerange_metrics::weights::WeightSet, &bool)| {
+        let entry = |(set, there): (&freerange_eval::metrics::weights::WeightSet, &bool)| {
             let files: Vec<&str> = set.files.iter().map(|f| f.path).collect();
             serde_json::json!({
                 "name": set.name, "purpose": set.purpose, "licence": set.licence, "files": files, "there": there,
@@ -99,7 +99,7 @@ fn list(args: &List) -> Result<(), CliError> {
 
 #[cfg(all(feature = "networks", not(feature = "fetch")))]
 fn fetch(args: &Fetch) -> Result<(), CliError> {
-    use freerange_metrics::weights::{Origin, set};
+    use freerange_eval::metrics::weights::{Origin, set};
     // Without the means to download, say what a user has to.
     let mut lines = vec![format!(
         "this program was built without downloads (build it with `cargo build --release --features fetch`, --hub {}); by \
@@ -122,7 +122,7 @@ fn fetch(args: &Fetch) -> Result<(), CliError> {
 
 #[cfg(feature = "fetch")]
 fn fetch(args: &Fetch) -> Result<(), CliError> {
-    use freerange_metrics::weights::{FetchOptions, fetch, set};
+    use freerange_eval::metrics::weights::{FetchOptions, fetch, set};
     let folder = args.weights.folder()?;
     for name in &args.names {
         set(name)?; // all names are looked at before the first download

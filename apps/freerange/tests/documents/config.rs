@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 
 use freerange::{Choices, DeviceName, Reconstructor};
-use freerange_build::MakingConfig;
-use freerange_flow::config::TrainConfig;
+use freerange_data::build::MakingConfig;
+use freerange_train::config::TrainConfig;
 use serde_json::Value;
 use syn::{Attribute, Expr, Fields, GenericArgument, Item, ItemEnum, ItemStruct, Lit, Meta, PathArguments, Type};
 

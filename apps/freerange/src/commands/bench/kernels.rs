@@ -3,9 +3,9 @@
 use std::path::Path;
 
 use burn::tensor::{Distribution, Tensor, TensorData};
-use freerange_camera::Camera;
 use freerange_model::{Compute, bench};
 use freerange_raster::{CHANNELS, RasterConfig, rasterize};
+use freerange_scene::camera::Camera;
 use glam::{DQuat, DVec3};
 use rand::SeedableRng;
 use serde::Serialize;

@@ -1,8 +1,8 @@
 //! Sums over the processes of a launcher.
 
 use burn::tensor::{Device, Distribution, Tensor};
-use freerange_flow::ranks::{Ranks, Wire, gather};
 use freerange_model::{ModelInfo, Workload};
+use freerange_train::ranks::{Ranks, Wire, gather};
 
 use super::{Args, Part, Printer, timer::Timer};
 use crate::{error::CliError, ranks::Job, runtime};

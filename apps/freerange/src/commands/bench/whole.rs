@@ -3,17 +3,17 @@
 use std::{ops::ControlFlow, path::Path, time::Instant};
 
 use burn::tensor::{Distribution, Tensor};
-use freerange_build::{GaussianSource, generate_object};
-use freerange_camera::View;
-use freerange_flow::{
-    batch::{Conditioning, shrink},
-    config::Stage,
+use freerange_data::build::{GaussianSource, generate_object};
+use freerange_diffusion::{
+    conditioning::Conditioning,
+    conditioning::shrink,
     photometric::{Images, Photometric},
     sample::{FlowConfig, FlowSampler},
-    trainer::Trainer,
 };
+use freerange_gaussians::Statistics;
 use freerange_model::{Checkpoint, Compute, EncoderConfig, Execution, FreeRange, ModelConfig, ModelInfo, Workload};
-use freerange_splat::Statistics;
+use freerange_scene::camera::View;
+use freerange_train::{config::Stage, trainer::Trainer};
 use rand::SeedableRng;
 use serde::Serialize;
 

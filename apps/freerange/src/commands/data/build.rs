@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
-use freerange_build::{BuildConfig, BuildOptions, GaussianSource, Items, Seconds, Share, Summary, build};
+use freerange_data::build::{BuildConfig, BuildOptions, GaussianSource, Items, Seconds, Share, Summary, build};
 use freerange_data::{HeldOutPsnr, Store};
 use freerange_eval::memory::peak_memory;
 

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::sync::Mutex;
 
-use freerange_build::{GaussianSource, Items, estimate};
+use freerange_data::build::{GaussianSource, Items, estimate};
 
 use super::build::{InputArgs, Settings, psnr_line, seconds_line};
 use crate::{error::CliError, progress::Progress};

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use freerange_build::{GalleryConfig, gallery};
+use freerange_data::build::{GalleryConfig, gallery};
 
 use crate::{error::CliError, runtime::TrainConfig};
 

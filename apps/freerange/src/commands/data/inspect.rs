@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use freerange_build::contact_sheet;
+use freerange_data::build::contact_sheet;
 use freerange_data::{ObjectSource, Shards, Store, inspect};
 
 use crate::error::CliError;

@@ -1,7 +1,7 @@
 //! `freerange data merge`
 
-use freerange_build::{collect, merge};
 use freerange_data::Store;
+use freerange_data::build::{collect, merge};
 
 use crate::error::CliError;
 

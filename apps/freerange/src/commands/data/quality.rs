@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use freerange_build::{GaussianSource, Quality, measure_quality};
+use freerange_data::build::{GaussianSource, Quality, measure_quality};
 
 use super::build::{InputArgs, Settings};
 use crate::{error::CliError, progress::Progress};
@@ -37,7 +37,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         if let Some(path) = &args.output {
             lines += &serde_json::to_string(&quality).map_err(CliError::input)?;
             lines.push('\n');
-            let written = freerange_core::write_atomically(path, |f| std::io::Write::write_all(f, lines.as_bytes()));
+            let written = freerange_util::write_atomically(path, |f| std::io::Write::write_all(f, lines.as_bytes()));
             written.map_err(|e| CliError::file(path, e))?;
         }
         bar.at(index + 1, &item.id);

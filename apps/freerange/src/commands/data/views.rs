@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use freerange_build::render_views;
-use freerange_camera::{View, transforms_json};
+use freerange_data::build::render_views;
+use freerange_scene::camera::{View, transforms_json};
 
 use super::build::{InputArgs, Settings};
 use crate::{error::CliError, output::OutputFolder, progress::Progress};

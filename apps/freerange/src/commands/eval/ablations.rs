@@ -191,7 +191,7 @@ impl Args {
         let markdown = document(study, environment);
         let write = |name: &str, text: &str| {
             let path = self.output.join(name);
-            freerange_core::write_atomically(&path, |f| std::io::Write::write_all(f, text.as_bytes()))
+            freerange_util::write_atomically(&path, |f| std::io::Write::write_all(f, text.as_bytes()))
                 .map_err(|e| CliError::file(&path, e))
         };
         let json = serde_json::to_string_pretty(study).map_err(CliError::input)?;

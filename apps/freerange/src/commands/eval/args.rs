@@ -3,13 +3,13 @@
 use std::{path::PathBuf, sync::Arc};
 
 use freerange::{Device, SETTINGS_SCHEMA, internal, machine};
-use freerange_core::Share;
+use freerange_eval::metrics::Metric;
 use freerange_eval::{
     Environment, Scorer, ScorerConfig,
     record::ViewSet,
     runner::{self, Shared},
 };
-use freerange_metrics::Metric;
+use freerange_util::Share;
 use serde_json::{Value, json};
 
 use super::{

@@ -11,8 +11,8 @@ use freerange_eval::{
     record::{Case, ViewSet},
     runner::{self, Reconstructed},
 };
-use freerange_fit::{FitConfig, Rates, fit};
-use freerange_splat::{Cloud, read_ply};
+use freerange_gaussians::{Cloud, read_ply};
+use freerange_optim::{FitConfig, Rates, fit};
 use serde_json::{Value, json};
 
 use crate::error::CliError;

@@ -6,9 +6,9 @@ use std::{
 };
 
 use freerange::{DeviceName, EncoderPlaces, Reconstructor, View, pictures::render_view};
-use freerange_camera::image_ops::{composite, resize_area, sheet, shrunk_size, to_picture};
 use freerange_eval::{EvalObject, record::ViewSet, runner::Objects};
-use freerange_splat::{Cloud, channel};
+use freerange_gaussians::{Cloud, channel};
+use freerange_scene::camera::image_ops::{composite, resize_area, sheet, shrunk_size, to_picture};
 use image::RgbaImage;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -142,6 +142,6 @@ fn told_apart(cloud: &Cloud) -> Cloud {
 fn save(picture: &RgbaImage, path: &Path) -> Result<(), CliError> {
     let mut bytes = std::io::Cursor::new(Vec::new());
     picture.write_to(&mut bytes, image::ImageFormat::Png).map_err(|e| CliError::file(path, e))?;
-    freerange_core::write_atomically(path, |file| std::io::Write::write_all(file, bytes.get_ref()))
+    freerange_util::write_atomically(path, |file| std::io::Write::write_all(file, bytes.get_ref()))
         .map_err(|e| CliError::file(path, e))
 }

@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use freerange_core::write_atomically;
 use freerange_eval::paper_tables::PaperTables;
+use freerange_util::write_atomically;
 
 use super::paper_pictures::PictureArgs;
 use crate::error::CliError;

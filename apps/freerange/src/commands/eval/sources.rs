@@ -6,16 +6,16 @@ use std::{
 };
 
 use freerange::{Scene, Up, View};
-use freerange_build::{BuildConfig, Item, Items, render_views, true_mesh};
-use freerange_core::{Note, NoteKind};
+use freerange_assets::mesh::{LoadLimits, load_mesh};
+use freerange_data::build::{BuildConfig, Item, Items, render_views, true_mesh};
 use freerange_data::{ObjectSource, Shards, Split, Store};
 use freerange_eval::{EvalObject, MeshSurface, runner::Objects};
-use freerange_mesh::{LoadLimits, load_mesh};
 use freerange_scene::{
     SceneConfig,
     read::{ReadConfig, cameras_with},
     views_to_compare,
 };
+use freerange_util::{Note, NoteKind};
 use glam::DVec3;
 use serde_json::{Value, json};
 

@@ -2,7 +2,7 @@
 //! pattern repeats, have as small ones.
 
 use freerange::{choose_views, internal::others_show, to_canonical};
-use freerange_camera::{Camera, Lens, cameras_up, nearest_point};
+use freerange_scene::camera::{Camera, Lens, cameras_up, nearest_point};
 use freerange_scene::{LoadConfig, Loaded, Scene, SceneConfig, SceneError, inspect::view_warnings, read::Cameras};
 use glam::{DMat3, DVec3};
 use serde::Serialize;

@@ -8,8 +8,8 @@ use std::{
 };
 
 use freerange::{Reconstructor, SETTINGS_SCHEMA, Scores};
-use freerange_core::write_atomically;
-use freerange_flow::ranks::gather;
+use freerange_train::ranks::gather;
+use freerange_util::write_atomically;
 use serde::{Deserialize, Serialize};
 
 use super::{Args, Program, SceneReport};

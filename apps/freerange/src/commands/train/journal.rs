@@ -2,8 +2,8 @@
 
 use std::path::Path;
 
-use freerange_flow::{
-    FlowError,
+use freerange_train::{
+    TrainError,
     events::Events,
     log::Log,
     trainer::{StepReport, Trainer, Validated},
@@ -20,20 +20,20 @@ pub struct Journal {
 
 impl Journal {
     /// That of a run in `folder`.
-    pub fn open(folder: &Path, trainer: &Trainer) -> Result<Self, FlowError> {
+    pub fn open(folder: &Path, trainer: &Trainer) -> Result<Self, TrainError> {
         let (step, total) = (trainer.step_count(), trainer.config().total_steps());
         let log = Log::open(&folder.join("log.jsonl"), step, trainer.measured())?;
         Ok(Self { log, events: Events::open(folder, step)?, bar: Progress::new("training", total) })
     }
 
-    pub fn step(&mut self, report: &StepReport) -> Result<(), FlowError> {
+    pub fn step(&mut self, report: &StepReport) -> Result<(), TrainError> {
         self.log.add(report)?;
         self.events.scalars(report.step, "train", report)?;
         self.bar.at(report.step, &line(report));
         Ok(())
     }
 
-    pub fn validated(&mut self, validated: &Validated) -> Result<(), FlowError> {
+    pub fn validated(&mut self, validated: &Validated) -> Result<(), TrainError> {
         self.log.add(validated)?;
         let Validated { step, validation: v, best, .. } = validated;
         self.events.scalars(*step, "validation", v)?;
@@ -48,7 +48,7 @@ impl Journal {
         Ok(())
     }
 
-    pub fn sync(&mut self) -> Result<(), FlowError> {
+    pub fn sync(&mut self) -> Result<(), TrainError> {
         self.log.sync()?;
         self.events.sync()
     }

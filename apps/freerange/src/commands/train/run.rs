@@ -2,7 +2,7 @@
 
 use std::ops::ControlFlow;
 
-use freerange_flow::{FlowError, trainer::Trainer};
+use freerange_train::{TrainError, trainer::Trainer};
 
 use super::{interrupt::Interrupt, journal::Journal};
 
@@ -13,7 +13,7 @@ pub struct Run<'a> {
     interrupt: &'a Interrupt,
     save_every: u64,
     unsaved: bool,
-    unwritten: Option<FlowError>, // why the journal cannot be written
+    unwritten: Option<TrainError>, // why the journal cannot be written
 }
 
 impl<'a> Run<'a> {
@@ -25,10 +25,10 @@ impl<'a> Run<'a> {
     ///
     /// # Errors
     /// The first thing that failed.
-    pub fn go_on(&mut self) -> Result<(), FlowError> {
+    pub fn go_on(&mut self) -> Result<(), TrainError> {
         let ended = self.advance();
         self.interrupt.heard();
-        if matches!(ended, Err(FlowError::Ranks { .. })) {
+        if matches!(ended, Err(TrainError::Ranks { .. })) {
             return ended;
         }
         let saved = self.save();
@@ -48,7 +48,7 @@ impl<'a> Run<'a> {
         }
     }
 
-    fn advance(&mut self) -> Result<(), FlowError> {
+    fn advance(&mut self) -> Result<(), TrainError> {
         let total = self.trainer.config().total_steps();
         loop {
             // The measurement of the step that a run was asked to end after comes first when it goes on.
@@ -64,7 +64,7 @@ impl<'a> Run<'a> {
                 self.save()?;
             }
             let report = match self.trainer.step() {
-                Err(FlowError::Cancelled) => return Ok(()),
+                Err(TrainError::Cancelled) => return Ok(()),
                 report => report?,
             };
             self.unsaved = true;
@@ -78,7 +78,7 @@ impl<'a> Run<'a> {
     }
 
     /// Saves what has changed.
-    fn save(&mut self) -> Result<(), FlowError> {
+    fn save(&mut self) -> Result<(), TrainError> {
         if self.unsaved {
             // First, so that the log has every step of the state.
             self.write(Journal::sync);
@@ -90,7 +90,7 @@ impl<'a> Run<'a> {
 
     /// Writes into the journal, if there is one. Other ranks hear that it could not be written with the next step: all end
     /// with a saved state.
-    fn write(&mut self, what: impl FnOnce(&mut Journal) -> Result<(), FlowError>) {
+    fn write(&mut self, what: impl FnOnce(&mut Journal) -> Result<(), TrainError>) {
         if let Some(Err(e)) = self.journal.as_mut().map(what) {
             self.interrupt.end();
             self.unwritten.get_or_insert(e);

@@ -1,0 +1,31 @@
+//! Clouds of 3D Gaussians: the 14 channels, their normalisation, the level-of-detail tree, and files.
+//!
+//! This crate knows nothing of tensors, images or cameras: everything downstream builds on it.
+//!
+//! Architecture invariant: no tensors, no images, no cameras.
+
+mod align;
+mod cloud;
+mod edit;
+mod eigen;
+mod error;
+pub mod formats;
+mod harmonics;
+mod merge;
+mod normalize;
+mod ply;
+mod ply_columns;
+mod ply_compressed;
+mod ply_header;
+mod splats;
+mod tree;
+
+pub use align::Alignment;
+pub use cloud::{Cloud, channel};
+pub use error::SplatError;
+pub use harmonics::{Harmonics, MAX_DEGREE, coefficients};
+pub use merge::{Gaussian, OPACITY_RANGE, merge};
+pub use normalize::{Normalization, STD_FLOOR, Statistics};
+pub use ply::{PlyFile, SCALE_OF_NONE, encode_ply, encode_splats, parse_ply, read_ply, write_ply, write_ply_at};
+pub use splats::{RenderMode, Splats};
+pub use tree::{LodTree, Node};

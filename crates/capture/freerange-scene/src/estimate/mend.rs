@@ -1,0 +1,111 @@
+//! Masks mended with what the other views show: a quick fit of all the others says where the object is in a view, and in which colour.
+
+use super::mask::{enlarged, smooth};
+use super::picture;
+use super::plane::Table;
+use super::{LARGE, Masks, Stage, odds};
+use crate::SceneError;
+use crate::camera::{View, image_ops::resize_area};
+use glam::Vec3;
+use image::RgbaImage;
+use rayon::prelude::*;
+
+/// Times that masks are mended, and the fewest views of which the others know enough for it.
+pub(super) const MENDING: usize = 2;
+pub(super) const LEAST_TO_MEND: usize = 5;
+/// Their alpha and one less it are raised by this before their ratio counts: log odds of 3 at most.
+const DOUBT: f32 = 0.05;
+/// Log odds against what lies outside of the hull, beside what the other views show.
+pub(super) const OUTSIDE_MENDING: f32 = 1.0;
+
+/// Shows each view as all the others have it, by whatever makes a shape of views: straight colour and alpha, in the order and size of the
+/// views, whose alpha is the masks as they are so far. Or says why not.
+pub type OthersShow = fn(&[View]) -> Result<Vec<RgbaImage>, String>;
+
+/// A view as the others have it.
+pub(super) struct Shown {
+    /// `[h, w]`
+    pub(super) alpha: Vec<f32>,
+    /// `[h, w]`, Lab
+    pub(super) colour: Vec<Vec3>,
+    /// How far colours may differ from it and still be the object's (Lab).
+    pub(super) scale: f32,
+}
+
+impl Shown {
+    fn of(image: &RgbaImage, scale: f32) -> Self {
+        Self {
+            alpha: image.pixels().map(|p| f32::from(p[3]) / 255.0).collect(),
+            colour: image.pixels().map(|p| picture::lab([p[0], p[1], p[2]])).collect(),
+            scale,
+        }
+    }
+
+    /// Log odds for the object by what is there alone.
+    pub(super) fn odds(&self, k: usize) -> f32 {
+        ((self.alpha[k] + DOUBT) / (1.0 - self.alpha[k] + DOUBT)).ln()
+    }
+}
+
+impl Stage {
+    /// Each view as the others have it, on a larger picture.
+    pub(super) fn shown_by_others(
+        &self,
+        views: &[View],
+        last: &Masks,
+        show: OthersShow,
+    ) -> Result<Vec<RgbaImage>, String> {
+        let cut_out: Vec<View> = (0..views.len())
+            .map(|i| {
+                let (picture, mut view) = (&self.pictures[i], picture::shrunk(&views[i], LARGE));
+                let (w, h) = (view.camera.width as usize, view.camera.height as usize);
+                let mask = smooth(&last.masks[i], picture.width(), picture.height());
+                let alpha = enlarged(&mask, picture.width(), picture.height(), w, h);
+                view.image.pixels_mut().zip(alpha).for_each(|(p, a)| p[3] = (255.0 * a).round() as u8);
+                view
+            })
+            .collect();
+        let shown = show(&cut_out)?;
+        let fits = |(image, view): (&RgbaImage, &View)| image.dimensions() == view.image.dimensions();
+        match shown.len() == views.len() && shown.iter().zip(&cut_out).all(fits) {
+            true => Ok(shown),
+            false => Err(format!("expected {} pictures of the views' sizes, found others", views.len())),
+        }
+    }
+
+    /// Cuts all views once more, with what the other views show of each.
+    pub(super) fn mend(&self, last: &Masks, shown: Vec<RgbaImage>) -> Result<Masks, SceneError> {
+        let count = self.pictures.len();
+        let near: Vec<Vec<f32>> = (0..count).map(|i| self.nearness(i)).collect();
+        let background = self.background(&last.masks);
+        let tables: Vec<Option<Table>> = (0..count).map(|i| self.table(&background, i)).collect();
+        let (object, behind) = self.colours(&near, &tables, Some(last))?;
+        let shown: Vec<[Shown; 2]> = (0..count)
+            .map(|i| {
+                let picture = &self.pictures[i];
+                let small = resize_area(&shown[i], picture.camera.width, picture.camera.height);
+                let mut small = Shown::of(&small, 0.0);
+                let sure = (0..small.alpha.len()).filter(|k| small.alpha[*k] > 0.9 && last.masks[i][*k]);
+                let mut off: Vec<f32> = sure.map(|k| picture.smooth[k].distance(small.colour[k])).collect();
+                off.sort_by(f32::total_cmp);
+                // Where they show nothing, any colour may be expected.
+                small.scale = 2.0 + 1.5 * off.get(off.len() / 2).copied().unwrap_or(20.0);
+                let large = Shown::of(&shown[i], small.scale);
+                [small, large]
+            })
+            .collect();
+        let masks: Vec<Vec<bool>> = (0..count)
+            .into_par_iter()
+            .map(|i| {
+                let [shown, _] = &shown[i];
+                let odds = odds(&self.pictures[i], &object, &behind, tables[i].as_ref(), Some(shown), |_| true);
+                let outside = |k: usize| if last.outlines[i][k] { 0.0 } else { OUTSIDE_MENDING };
+                self.cut(i, &near[i], &odds, Some(&last.outlines[i]), |k| odds[k] + shown.odds(k) - outside(k))
+            })
+            .collect();
+        let outlines = self.outlines(&masks).ok_or_else(|| SceneError::NotCutOut {
+            reason: "no point of space lies within all masks once they are mended with what other views show".into(),
+        })?;
+        Ok(Masks { masks, clearness: last.clearness.clone(), object, background: behind, outlines, shown })
+    }
+}

@@ -1,0 +1,612 @@
+//! Masks from poses and colours alone.
+//!
+//! What is used, in short: the cameras look at the object, so that their axes meet in it (Campbell et al. 2010); what lies at the borders
+//! of the photos is not the object; objects stand on something flat, whose look is known from the views that see past the object
+//! (`plane`); colours of object and background are mixtures of Gaussians, common to all views, and each view is cut at least cost
+//! (GrabCut, Rother et al. 2004); what no other view confirms is not the object (`hull`). These take turns until nothing changes. Then,
+//! where there is something that makes Gaussians of views ([`OthersShow`]), each mask is mended with what all the others make of its view:
+//! print in the table's colour, a foot in its own shadow, the opening of a handle. Work is done on small pictures, and only the outline is
+//! cut again on larger ones.
+
+mod confirm;
+mod evidence;
+mod hull;
+mod mask;
+mod maxflow;
+mod mend;
+mod mixture;
+mod picture;
+mod plane;
+
+pub use confirm::confirmed;
+pub use evidence::{Compared, Evidence};
+pub use hull::overlap;
+pub use mend::OthersShow;
+
+use crate::SceneError;
+use crate::camera::{View, cameras_up};
+use glam::{DMat3, DVec3, Vec3};
+use hull::{Floor, Hull, reaches_border};
+use image::RgbaImage;
+use mask::{enlarged, grown, shrunk, smooth, soft, tidy};
+use maxflow::Grid;
+use mend::{LEAST_TO_MEND, MENDING, OUTSIDE_MENDING, Shown};
+use mixture::Mixture;
+use picture::{Picture, STEPS};
+use plane::{Plane, Table};
+use rayon::prelude::*;
+
+/// Longer side of the pictures that take turns, and of those that the outline is cut on.
+const SMALL: u32 = 320;
+const LARGE: u32 = 640;
+/// Turns, at most.
+const TURNS: usize = 10;
+/// Turns end when masks change by less than this share.
+const SETTLED: f64 = 0.002;
+/// What parting two like neighbours costs, in units of a pixel's log odds.
+const SMOOTHNESS: f32 = 40.0;
+/// No pixel's log odds count for more.
+const MOST: f32 = 6.0;
+/// Log odds against what lies outside of the other views' hull.
+const OUTSIDE: f32 = 5.0;
+/// Log odds for what lies within it.
+const INSIDE: f32 = 1.0;
+/// How far from where the cameras look, in radii of the sphere about it, the table is not believed before there are masks, and from where it
+/// is. Less, and the foot of what has one colour is taken for a print on the table, on which all views agree.
+const UNSEEN: f32 = 0.7;
+const SEEN: f32 = 0.95;
+/// Before there are masks, colours that are certainly the object's stand for all of it if they are this share of what lies about where the
+/// cameras look. A handle that stands out is less: what it belongs to may lie flat on the table.
+const SURE: f64 = 0.02;
+/// Voxels along the hull's longest side: while masks change, and to judge them.
+const ROUGH: usize = 56;
+const FINE: usize = 120;
+/// Most that is believed of the table: something else may lie there. Less while masks are mended, where others have a say.
+const TRUST: f32 = 0.99;
+const TRUST_MENDING: f32 = 0.5;
+/// Most that is believed of the colour that the other views show.
+const TRUST_OTHERS: f32 = 0.9;
+/// Costs are whole numbers: this many to one.
+const UNIT: f32 = 1024.0;
+/// Log density of a colour that nobody has seen before: even over Lab.
+const NOVEL: f32 = -12.9;
+/// Components of the mixtures.
+const OBJECT: usize = 5;
+const BACKGROUND: usize = 8;
+
+/// What is known beforehand.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Hints {
+    /// What masks are mended with; none: they are not.
+    pub others: Option<OthersShow>,
+    /// The object's middle, in the world.
+    pub center: Option<DVec3>,
+    /// The radius of a sphere about it that holds the object.
+    pub radius: Option<f64>,
+}
+
+/// Masks that were found, and how far to rely on them.
+#[derive(Clone, Debug)]
+pub struct Estimate {
+    /// The object's share of each pixel, for every view at its image's own size, `[h, w]`.
+    pub alpha: Vec<Vec<u8>>,
+    /// For every view: how far its mask agrees with the hull of all masks (intersection over union).
+    pub agreement: Vec<f64>,
+    /// For every view: the share of pixels about the object whose own colour speaks for the side that they were put on.
+    pub clearness: Vec<f64>,
+    /// The direction in which the plane that the object stands on faces, where one was found.
+    pub up: Option<DVec3>,
+    /// What speaks for the poses.
+    pub evidence: Evidence,
+    /// What was found, for the user to read.
+    pub notes: Vec<String>,
+}
+
+impl Estimate {
+    /// How sure it is, 0 to 1: the least of mean agreement and mean clearness.
+    pub fn sureness(&self) -> f64 {
+        let mean = |v: &[f64]| v.iter().sum::<f64>() / v.len().max(1) as f64;
+        mean(&self.agreement).min(mean(&self.clearness))
+    }
+
+    /// Why these masks should not be used, if views and poses do not belong together.
+    fn contradiction(&self, views: &[View]) -> Option<String> {
+        let mean = self.agreement.iter().sum::<f64>() / self.agreement.len() as f64;
+        let found = if mean < LEAST_AGREEMENT {
+            format!("masks and their common hull agree to {:.0} %", 100.0 * mean)
+        } else {
+            self.evidence.against()?
+        };
+        let worst = (0..views.len()).min_by(|a, b| self.agreement[*a].total_cmp(&self.agreement[*b])).unwrap_or(0);
+        Some(format!(
+            "the views contradict each other ({found}; {} agrees least): the poses may be wrong or belong to other photos, or the object \
+             moved, or it cannot be told from the background",
+            views[worst].name
+        ))
+    }
+}
+
+/// Mean agreement below which views are taken to contradict each other.
+const LEAST_AGREEMENT: f64 = 0.7;
+
+/// Finds the object's masks. The views' own alpha only says what they show (corners of undistorted photos are empty).
+pub fn masks(views: &[View], hints: &Hints) -> Result<Estimate, SceneError> {
+    let found = unjudged(views, hints)?;
+    match found.contradiction(views) {
+        Some(reason) => Err(SceneError::NotCutOut { reason }),
+        None => Ok(found),
+    }
+}
+
+/// [`masks`] also where the views contradict each other. For tests.
+#[doc(hidden)]
+pub fn unjudged(views: &[View], hints: &Hints) -> Result<Estimate, SceneError> {
+    let refuse = |reason: String| Err(SceneError::NotCutOut { reason });
+    if views.len() < 3 {
+        return refuse(format!("expected at least 3 views, found {}", views.len()));
+    }
+    let stage = Stage::new(views, hints)?;
+    let mut notes = Vec::new();
+    match &stage.plane {
+        Some(plane) => notes.push(format!(
+            "the object stands on a plane that faces ({:.3}, {:.3}, {:.3})",
+            plane.normal.x, plane.normal.y, plane.normal.z
+        )),
+        None => notes.push("no plane beneath the object stands out: masks rest on colours and outlines alone".into()),
+    }
+    let mut small = stage.take_turns()?;
+    // Poses are judged by what photos say themselves.
+    let evidence = stage.evidence(&small);
+    if let Some(others) = hints.others.filter(|_| views.len() >= LEAST_TO_MEND) {
+        for _ in 0..MENDING {
+            match stage.shown_by_others(views, &small, others) {
+                Ok(shown) => small = stage.mend(&small, shown)?,
+                Err(reason) => {
+                    notes.push(format!("masks are not mended with what other views show: {reason}"));
+                    break;
+                }
+            }
+        }
+    }
+    let large = stage.sharpen(views, &small)?;
+    let hull = Hull::carve(&large.pictures, &large.masks, stage.centre, 1.3 * stage.radius, stage.floor(), 0, FINE);
+    let agreement: Vec<f64> = match &hull {
+        Some(hull) => large.pictures.iter().zip(&large.masks).map(|(p, m)| overlap(&hull.outline(p), m)).collect(),
+        None => vec![0.0; views.len()],
+    };
+    for (view, mask) in views.iter().zip(&large.masks) {
+        let share = mask.iter().filter(|m| **m).count() as f64 / mask.len() as f64;
+        if share < 1e-3 {
+            return refuse(format!("nothing in {} differs from what is around the object", view.name));
+        }
+    }
+    let alpha = views
+        .iter()
+        .zip(large.pictures.iter().zip(&large.masks))
+        .map(|(view, (picture, mask))| soft(mask, picture, view.image.dimensions()))
+        .collect();
+    let up = stage.plane.as_ref().map(|p| p.normal);
+    Ok(Estimate { alpha, agreement, clearness: small.clearness, up, evidence, notes })
+}
+
+/// The scene as far as it does not change while masks are looked for.
+struct Stage {
+    pictures: Vec<Picture>,
+    /// Where the cameras look, and the sphere about it that the object is expected in.
+    centre: DVec3,
+    radius: f64,
+    /// Mean distance of the cameras.
+    distance: f64,
+    plane: Option<Plane>,
+    /// The plane on which the views agree best, whether it stands out or not.
+    best: Option<Plane>,
+}
+
+/// Masks in the making.
+struct Masks {
+    /// `[h, w]` for each view.
+    masks: Vec<Vec<bool>>,
+    clearness: Vec<f64>,
+    object: Mixture,
+    background: Mixture,
+    /// The hull's outlines, `[h, w]`.
+    outlines: Vec<Vec<bool>>,
+    /// What the other views show of each, as it is wanted for small and for large pictures; empty before masks are mended.
+    shown: Vec<[Shown; 2]>,
+}
+
+/// How likely a colour is that is so far from the one expected: a density in three dimensions that falls exponentially, its logarithm.
+fn log_likely(off: f32, scale: f32) -> f32 {
+    -2.0 * off / scale - (std::f32::consts::PI * scale.powi(3)).ln()
+}
+
+/// Masks on larger pictures.
+struct Sharp {
+    pictures: Vec<Picture>,
+    masks: Vec<Vec<bool>>,
+}
+
+/// The point nearest to the optical axes, in front of all cameras.
+fn meeting_point(views: &[View]) -> Option<DVec3> {
+    let (mut normal, mut right) = (DMat3::ZERO, DVec3::ZERO);
+    for view in views {
+        let d = DMat3::from_mat4(view.camera.world_to_camera).transpose().z_axis;
+        let across = DMat3::IDENTITY - DMat3::from_cols(d * d.x, d * d.y, d * d.z);
+        normal += across;
+        right += across * view.camera.center();
+    }
+    // The determinant falls with the squared angle between the axes; 1e-4 is about one degree.
+    if normal.determinant() < 1e-4 * (views.len() as f64).powi(3) {
+        return None;
+    }
+    let point = normal.inverse() * right;
+    let ahead = |v: &View| (v.camera.world_to_camera * point.extend(1.0)).z > 0.0;
+    (point.is_finite() && views.iter().all(ahead)).then_some(point)
+}
+
+/// Which way is up, as far as the cameras tell.
+fn mean_up(views: &[View]) -> DVec3 {
+    cameras_up(views).unwrap_or(DVec3::Z)
+}
+
+/// How far the ray through a pixel passes by `centre`.
+fn passes_by(picture: &Picture, centre: DVec3, x: f64, y: f64) -> f64 {
+    (centre - picture.camera.center()).cross(picture.camera.ray_direction(x, y)).length()
+}
+
+/// The radius of the sphere about `centre` that the object is expected in: the hint's and a little more, or of the largest that half of the
+/// views show whole, as objects are shown whole. None where most views do not show its middle.
+fn expected_radius(pictures: &[Picture], centre: DVec3, hints: &Hints) -> Option<f64> {
+    let mut radii: Vec<f64> = pictures
+        .iter()
+        .map(|p| {
+            let (w, h) = (p.width() as f64, p.height() as f64);
+            let (x, y, z) = p.project(centre);
+            if z <= 0.0 || x <= 0.0 || y <= 0.0 || x >= w || y >= h {
+                return 0.0;
+            }
+            let border = [(0.0, y), (w, y), (x, 0.0), (x, h)];
+            border.iter().map(|(x, y)| passes_by(p, centre, *x, *y)).fold(f64::INFINITY, f64::min)
+        })
+        .collect();
+    radii.sort_by(f64::total_cmp);
+    let radius = hints.radius.map_or(radii[radii.len() / 2], |r| 1.1 * r);
+    (radius > 0.0).then_some(radius)
+}
+
+impl Stage {
+    fn new(views: &[View], hints: &Hints) -> Result<Self, SceneError> {
+        let pictures: Vec<Picture> = views.par_iter().map(|v| Picture::of(v, SMALL)).collect();
+        let Some(centre) = hints.center.or_else(|| meeting_point(views)) else {
+            let reason = "the cameras do not look at one common point; if the poses are right, say where the object is (--center X,Y,Z)";
+            return Err(SceneError::NotCutOut { reason: reason.into() });
+        };
+        let distance = views.iter().map(|v| v.camera.center().distance(centre)).sum::<f64>() / views.len() as f64;
+        let Some(radius) = expected_radius(&pictures, centre, hints) else {
+            let reason =
+                "the point that the cameras look at is not in the photos; say where the object is (--center X,Y,Z)";
+            return Err(SceneError::NotCutOut { reason: reason.into() });
+        };
+        let mut stage = Self { pictures, centre, radius, distance, plane: None, best: None };
+        let object: Vec<Vec<bool>> =
+            (0..views.len()).map(|i| stage.nearness(i).iter().map(|d| *d < 0.6).collect()).collect();
+        let found = plane::find(&stage.pictures, &object, centre, mean_up(views), distance);
+        stage.plane = found.filter(|(_, stands_out)| *stands_out).map(|(plane, _)| plane);
+        stage.best = found.map(|(plane, _)| plane);
+        Ok(stage)
+    }
+
+    fn evidence(&self, found: &Masks) -> Evidence {
+        let reach = 1.3 * self.radius;
+        let missing = usize::from(self.pictures.len() >= 6);
+        let hull = Hull::carve(&self.pictures, &found.masks, self.centre, reach, self.floor(), missing, 2 * ROUGH);
+        let (masks, plane) = (&found.masks, self.best.as_ref());
+        evidence::gather(&self.pictures, masks, hull.as_ref(), self.centre, reach, plane, self.distance)
+    }
+
+    fn floor(&self) -> Floor {
+        self.plane.as_ref().map(|p| (p.normal, p.height))
+    }
+
+    /// How far each pixel's ray passes by the centre, in radii: `[h, w]`.
+    fn nearness(&self, i: usize) -> Vec<f32> {
+        nearness(&self.pictures[i], self.centre, self.radius)
+    }
+
+    fn table(&self, background: &[Vec<f32>], i: usize) -> Option<Table> {
+        let plane = self.plane.as_ref()?;
+        Some(plane::table(&self.pictures, background, i, self.centre, plane, self.distance, |_| true))
+    }
+
+    /// Cuts all views in turns until their masks stay as they are.
+    fn take_turns(&self) -> Result<Masks, SceneError> {
+        let count = self.pictures.len();
+        let near: Vec<Vec<f32>> = (0..count).map(|i| self.nearness(i)).collect();
+        let mut background: Vec<Vec<f32>> =
+            near.iter().map(|n| n.iter().map(|d| ((d - UNSEEN) / (SEEN - UNSEEN)).clamp(0.0, 1.0)).collect()).collect();
+        let mut last: Option<Masks> = None;
+        for _ in 0..TURNS {
+            let tables: Vec<Option<Table>> = (0..count).map(|i| self.table(&background, i)).collect();
+            let (object, behind) = self.colours(&near, &tables, last.as_ref())?;
+            let cut: Vec<(Vec<bool>, f64)> = (0..count)
+                .into_par_iter()
+                .map(|i| {
+                    let odds = odds(&self.pictures[i], &object, &behind, tables[i].as_ref(), None, |_| true);
+                    let biased = |k: usize| match &last {
+                        Some(last) if last.outlines[i][k] => odds[k] + INSIDE,
+                        Some(_) => odds[k] - OUTSIDE,
+                        None => odds[k],
+                    };
+                    let mask = self.cut(i, &near[i], &odds, last.as_ref().map(|l| &l.outlines[i][..]), biased);
+                    let about = (0..mask.len()).filter(|k| near[i][*k] < 1.0);
+                    let (right, all) = about.fold((0usize, 0usize), |(right, all), k| {
+                        (right + usize::from(mask[k] == (odds[k] > 0.0)), all + 1)
+                    });
+                    (mask, right as f64 / all.max(1) as f64)
+                })
+                .collect();
+            let (masks, clearness): (Vec<Vec<bool>>, Vec<f64>) = cut.into_iter().unzip();
+            let outlines = self.outlines(&masks).ok_or_else(|| SceneError::NotCutOut {
+                reason:
+                    "no point of space lies within the masks of all views: the poses may be wrong, or the object moved"
+                        .into(),
+            })?;
+            background = self.background(&masks);
+            let change = last.as_ref().map_or(1.0, |l| {
+                l.masks.iter().zip(&masks).map(|(a, b)| 1.0 - overlap(a, b)).sum::<f64>() / count as f64
+            });
+            last = Some(Masks { masks, clearness, object, background: behind, outlines, shown: Vec::new() });
+            if change < SETTLED {
+                break;
+            }
+        }
+        last.ok_or_else(|| SceneError::NotCutOut { reason: "no turns".into() })
+    }
+
+    /// The small picture `i` cut at these log odds, tidied by what colours alone and the hull's outline say.
+    fn cut(
+        &self,
+        i: usize,
+        near: &[f32],
+        odds: &[f32],
+        outline: Option<&[bool]>,
+        biased: impl Fn(usize) -> f32,
+    ) -> Vec<bool> {
+        let picture = &self.pictures[i];
+        let beyond = |k: usize| near[k] > 1.3 || !picture.valid[k];
+        let biased: Vec<f32> = (0..odds.len()).map(|k| if beyond(k) { -50.0 } else { biased(k) }).collect();
+        tidy(&cut(picture, &biased, None), odds, outline, picture)
+    }
+
+    /// Where the hull of small masks appears in each picture, and a little around it.
+    fn outlines(&self, masks: &[Vec<bool>]) -> Option<Vec<Vec<bool>>> {
+        let missing = usize::from(masks.len() >= 6);
+        let hull = Hull::carve(&self.pictures, masks, self.centre, 1.3 * self.radius, self.floor(), missing, ROUGH)?;
+        Some(self.pictures.par_iter().map(|p| grown(&hull.outline(p), p.width(), p.height(), 2)).collect())
+    }
+
+    /// How likely each pixel of each small picture is not the object.
+    fn background(&self, masks: &[Vec<bool>]) -> Vec<Vec<f32>> {
+        let of = |(m, p): (&Vec<bool>, &Picture)| {
+            smooth(m, p.width(), p.height()).iter().map(|v| (1.0 - v).clamp(0.03, 1.0)).collect()
+        };
+        masks.iter().zip(&self.pictures).map(of).collect()
+    }
+
+    /// Colours of the object and of the rest, from the last masks or from where the cameras look.
+    fn colours(
+        &self,
+        near: &[Vec<f32>],
+        tables: &[Option<Table>],
+        last: Option<&Masks>,
+    ) -> Result<(Mixture, Mixture), SceneError> {
+        let (mut object, mut sure, mut rest, mut below) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        for (i, picture) in self.pictures.iter().enumerate() {
+            for (k, colour) in picture.lab.iter().enumerate().filter(|(k, _)| picture.valid[*k]) {
+                let (inside, outside) = match last {
+                    Some(last) => (last.masks[i][k], !last.masks[i][k]),
+                    None => (near[i][k] < 0.55, near[i][k] > 0.95),
+                };
+                if outside {
+                    rest.push(*colour);
+                }
+                if inside {
+                    object.push(*colour);
+                }
+                if let Some(table) = &tables[i] {
+                    // Not what the table looks like there: no shadow, whatever its colour.
+                    let least = if last.is_some() { 2.0 } else { 4.0 };
+                    if inside
+                        && table.trust[k] > 0.3
+                        && picture.smooth[k].distance(table.colour[k]) > least * table.scale[k]
+                    {
+                        sure.push(*colour);
+                    }
+                    if near[i][k] < 1.0 && table.trust[k] > 0.8 && table.scale[k] < 10.0 {
+                        below.push(table.colour[k]);
+                    }
+                }
+            }
+        }
+        let enough = if last.is_some() { 0.3 } else { SURE };
+        if sure.len() as f64 >= enough * object.len() as f64 {
+            object = sure;
+        }
+        // The table about the object counts as much as all else: its shadows are what objects are mistaken for.
+        let mut behind = thinned(&rest, 4000);
+        behind.extend(thinned(&below, 3000));
+        match (Mixture::fit(&object, OBJECT, 0), Mixture::fit(&behind, BACKGROUND, 1)) {
+            (Some(object), Some(behind)) => Ok((object, behind)),
+            (None, _) => Err(SceneError::NotCutOut { reason: "nothing differs from what is around the object".into() }),
+            (_, None) => Err(SceneError::NotCutOut {
+                reason: "the object fills the photos: nothing shows the background".into(),
+            }),
+        }
+    }
+
+    /// Cuts the outlines again on larger pictures.
+    fn sharpen(&self, views: &[View], small: &Masks) -> Result<Sharp, SceneError> {
+        let pictures: Vec<Picture> = views.par_iter().map(|v| Picture::of(v, LARGE)).collect();
+        let shares: Vec<Vec<f32>> = (0..views.len())
+            .map(|i| {
+                let (from, to) = (&self.pictures[i], &pictures[i]);
+                let mask: Vec<f32> = small.masks[i].iter().map(|m| f32::from(u8::from(*m))).collect();
+                enlarged(&mask, from.width(), from.height(), to.width(), to.height())
+            })
+            .collect();
+        let background: Vec<Vec<f32>> =
+            shares.iter().map(|s| s.iter().map(|v| (1.0 - v).clamp(0.03, 1.0)).collect()).collect();
+        let masks = (0..views.len())
+            .map(|i| {
+                let picture = &pictures[i];
+                let (w, h) = (picture.width(), picture.height());
+                let rough: Vec<bool> = shares[i].iter().map(|s| *s > 0.5).collect();
+                let outer = grown(&rough, w, h, 8);
+                let inner = shrunk(&rough, w, h, 8);
+                let open = |k: usize| outer[k] && !inner[k];
+                let table = self
+                    .plane
+                    .as_ref()
+                    .map(|plane| plane::table(&pictures, &background, i, self.centre, plane, self.distance, open));
+                let shown = small.shown.get(i).map(|[_, large]| large);
+                let odds = odds(picture, &small.object, &small.background, table.as_ref(), shown, open);
+                let outline: Vec<f32> = small.outlines[i].iter().map(|m| f32::from(u8::from(*m))).collect();
+                let from = &self.pictures[i];
+                let outline = enlarged(&outline, from.width(), from.height(), w, h);
+                let outline: Vec<bool> = outline.iter().map(|o| *o > 0.5).collect();
+                let mut biased = odds.clone();
+                for (k, o) in biased.iter_mut().enumerate() {
+                    *o += match shown {
+                        Some(shown) => shown.odds(k) - if outline[k] { 0.0 } else { OUTSIDE_MENDING },
+                        None if outline[k] => INSIDE,
+                        None => -OUTSIDE,
+                    };
+                }
+                let mask = cut(picture, &biased, Some((&inner, &outer)));
+                tidy(&mask, &odds, Some(&outline), picture)
+            })
+            .collect();
+        Ok(Sharp { pictures, masks })
+    }
+}
+
+fn nearness(picture: &Picture, centre: DVec3, radius: f64) -> Vec<f32> {
+    let (w, h) = (picture.width(), picture.height());
+    let at = |k: usize| passes_by(picture, centre, (k % w) as f64 + 0.5, (k / w) as f64 + 0.5);
+    (0..w * h).map(|k| (at(k) / radius) as f32).collect()
+}
+
+/// Every so manyth colour, so that about `count` are left.
+fn thinned(colours: &[Vec3], count: usize) -> Vec<Vec3> {
+    colours.iter().step_by((colours.len() / count).max(1)).copied().collect()
+}
+
+fn log_add(a: f32, b: f32) -> f32 {
+    let most = a.max(b);
+    most + ((a - most).exp() + (b - most).exp()).ln()
+}
+
+/// Log odds of each pixel for the object, at the pixels `wanted`; 0 elsewhere. `[h, w]`
+fn odds(
+    picture: &Picture,
+    object: &Mixture,
+    behind: &Mixture,
+    table: Option<&Table>,
+    shown: Option<&Shown>,
+    wanted: impl Fn(usize) -> bool,
+) -> Vec<f32> {
+    (0..picture.lab.len())
+        .map(|k| {
+            if !wanted(k) {
+                return 0.0;
+            }
+            let colour = picture.lab[k];
+            let rest = log_add(behind.log_density(colour) - 0.05, NOVEL - 3.0);
+            // An object may have any colour that the scene has, if seldom.
+            let own = log_add(log_add(object.log_density(colour) - 0.16, NOVEL - 2.3), rest - 3.0);
+            let rest = match table {
+                Some(table) if table.trust[k] > 0.0 => {
+                    let most = if shown.is_some() { TRUST_MENDING } else { TRUST };
+                    let (trust, scale) = (most * table.trust[k], table.scale[k]);
+                    let off = picture.smooth[k].distance(table.colour[k]);
+                    log_add(trust.ln() + log_likely(off, scale), (1.0 - trust).ln() + rest)
+                }
+                _ => rest,
+            };
+            let own = match shown {
+                Some(shown) if shown.alpha[k] > 0.0 => {
+                    let trust = TRUST_OTHERS * shown.alpha[k];
+                    let off = picture.smooth[k].distance(shown.colour[k]);
+                    log_add(trust.ln() + log_likely(off, shown.scale), (1.0 - trust).ln() + own)
+                }
+                _ => own,
+            };
+            (own - rest).clamp(-MOST, MOST)
+        })
+        .collect()
+}
+
+/// The cheapest cut for these log odds. `bounds`: what is inside in any case, and outside of what nothing is.
+fn cut(picture: &Picture, odds: &[f32], bounds: Option<(&[bool], &[bool])>) -> Vec<bool> {
+    let (w, h) = (picture.width(), picture.height());
+    let mut grid = Grid::new(w, h);
+    for k in 0..w * h {
+        let (x, y) = (k % w, k / w);
+        let odds = match bounds {
+            Some((inner, _)) if inner[k] => 1e4,
+            Some((_, outer)) if !outer[k] => -1e4,
+            _ => odds[k],
+        };
+        grid.set_terminal(x, y, (odds * UNIT) as i32);
+        for which in 0..STEPS.len() {
+            grid.set_edge(x, y, which, (SMOOTHNESS * UNIT * picture.alike[k][which]) as i32);
+        }
+    }
+    grid.cut()
+}
+
+/// Whether masks at full size reach the border of their views.
+pub(crate) fn cut_off(alpha: &[u8], w: u32, h: u32) -> bool {
+    let mask: Vec<bool> = alpha.iter().map(|a| *a >= 128).collect();
+    reaches_border(&mask, w as usize, h as usize)
+}
+
+/// How far masks (the views' alpha) agree with their common hull, for each view: intersection over union. The hull is looked for in the
+/// sphere of this `radius` about `centre`.
+pub fn agreement(views: &[View], centre: DVec3, radius: f64) -> Vec<f64> {
+    let pictures: Vec<Picture> = views.par_iter().map(|v| Picture::of(v, SMALL)).collect();
+    let masks: Vec<Vec<bool>> = pictures.iter().map(|p| p.valid.clone()).collect();
+    match Hull::carve(&pictures, &masks, centre, radius, None, 0, FINE) {
+        Some(hull) => pictures.iter().zip(&masks).map(|(p, m)| overlap(&hull.outline(p), m)).collect(),
+        None => vec![0.0; views.len()],
+    }
+}
+
+/// How far each mask (the views' alpha) and those of the others contradict each other, 0 to 1: the share of it that lies outside of the
+/// others' hull, or the share of the others that it alone keeps out of the hull, on average; the larger of both. For three views or more.
+pub fn contradictions(views: &[View], centre: DVec3, radius: f64) -> Vec<f64> {
+    let pictures: Vec<Picture> = views.par_iter().map(|v| Picture::of(v, SMALL)).collect();
+    let masks: Vec<Vec<bool>> = pictures.iter().map(|p| p.valid.clone()).collect();
+    evidence::contradictions(&pictures, &masks, centre, radius)
+}
+
+/// The direction in which the plane faces that the object stands on, where one stands out. `views`: the object cut out; `whole`: the
+/// photos with what is around it, in the same order.
+pub fn table_faces(views: &[View], whole: &[RgbaImage]) -> Option<DVec3> {
+    let centre = meeting_point(views).filter(|_| views.len() >= 3)?;
+    let distance = views.iter().map(|v| v.camera.center().distance(centre)).sum::<f64>() / views.len() as f64;
+    let object: Vec<Vec<bool>> = views
+        .par_iter()
+        .map(|v| {
+            let p = Picture::of(v, SMALL);
+            grown(&p.valid, p.width(), p.height(), 4)
+        })
+        .collect();
+    let pictures: Vec<Picture> = views
+        .par_iter()
+        .zip(whole)
+        .map(|(v, image)| Picture::of(&View { name: String::new(), camera: v.camera, image: image.clone() }, SMALL))
+        .collect();
+    let (plane, stands_out) = plane::find(&pictures, &object, centre, mean_up(views), distance)?;
+    stands_out.then_some(plane.normal)
+}

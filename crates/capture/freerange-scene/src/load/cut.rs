@@ -1,0 +1,178 @@
+//! Views without what is around the object: by mask files, alpha, a plain backdrop, a network, or poses and colors.
+
+use super::{LoadConfig, MaskKind, MaskModel, MaskSource};
+use crate::camera::{View, scene::cut_out};
+use crate::{
+    SceneError,
+    estimate::{self, Estimate, Hints},
+};
+use freerange_util::{Invalid, Note};
+use image::{GrayImage, Rgba, RgbaImage};
+use rayon::prelude::*;
+
+fn opaque(image: &RgbaImage) -> bool {
+    image.pixels().all(|p| p[3] == 255)
+}
+
+pub(super) fn plain(view: &View) -> Result<RgbaImage, SceneError> {
+    cut_out(&view.image).map(|(image, _)| image).map_err(|found| SceneError::Mask {
+        name: view.name.clone(),
+        expected: "an alpha channel, or one plain color behind the object".into(),
+        found,
+    })
+}
+
+/// Cuts the object out of views that are in memory, as [`load`](super::load) does by default: those with transparency keep it, a plain background is
+/// cut away; where neither is there, poses and colors tell. Returns what was done, for the user to read.
+pub fn cut(views: &mut [View], hints: &Hints) -> Result<Vec<Note>, SceneError> {
+    let told: Vec<Told> = views.iter().map(|v| Told { mask: None, alpha: !opaque(&v.image) }).collect();
+    let mut notes = Vec::new();
+    cut_all(views, &told, &LoadConfig { hints: *hints, ..LoadConfig::default() }, &mut notes)?;
+    Ok(notes)
+}
+
+/// What a picture itself says of the object.
+pub(super) struct Told {
+    pub mask: Option<GrayImage>,
+    /// As `Picture::alpha`.
+    pub alpha: bool,
+}
+
+/// Gives the views their masks.
+pub(super) fn cut_all(
+    views: &mut [View],
+    told: &[Told],
+    config: &LoadConfig,
+    notes: &mut Vec<Note>,
+) -> Result<(MaskKind, Option<Estimate>), SceneError> {
+    let found = mask_all(views, told, config, notes)?;
+    match views.iter().find(|view| view.image.pixels().all(|p| p[3] < 128)) {
+        None => Ok(found),
+        Some(view) => {
+            let expected = "a mask that shows the object".into();
+            Err(SceneError::Mask { name: view.name.clone(), expected, found: "one that is empty".into() })
+        }
+    }
+}
+
+/// [`cut_all`], whatever the masks show.
+fn mask_all(
+    views: &mut [View],
+    told: &[Told],
+    config: &LoadConfig,
+    notes: &mut Vec<Note>,
+) -> Result<(MaskKind, Option<Estimate>), SceneError> {
+    if told.iter().all(|p| p.mask.is_some()) {
+        for (view, picture) in views.iter_mut().zip(told) {
+            if let Some(mask) = &picture.mask {
+                set_alpha(&mut view.image, mask.as_raw());
+            }
+        }
+        return Ok((MaskKind::Files, None));
+    }
+    if let MaskSource::Model(model) = &config.masks {
+        by_network(views, model, config, notes)?;
+        return Ok((MaskKind::Model, None));
+    }
+    if config.masks != MaskSource::Estimate
+        && let Some(kind) = by_alpha_or_backdrop(views, told, config, notes)?
+    {
+        return Ok((kind, None));
+    }
+    let estimate = estimate::masks(views, &config.hints)?;
+    for (view, alpha) in views.iter_mut().zip(&estimate.alpha) {
+        set_alpha(&mut view.image, alpha);
+    }
+    notes.push(Note::understood(format!(
+        "the object was cut out from poses and colors, {:.0} % sure (views agree to {:.0} % at least)",
+        100.0 * estimate.sureness(),
+        100.0 * estimate.agreement.iter().copied().fold(1.0, f64::min)
+    )));
+    notes.extend(estimate.notes.iter().map(Note::understood));
+    Ok((MaskKind::Estimate, Some(estimate)))
+}
+
+fn by_network(
+    views: &mut [View],
+    model: &MaskModel,
+    config: &LoadConfig,
+    notes: &mut Vec<Note>,
+) -> Result<(), SceneError> {
+    let found = network(model, views)?;
+    for (view, alpha) in views.iter_mut().zip(found) {
+        set_alpha(&mut view.image, &alpha);
+    }
+    notes.push(Note::understood(format!("the object was cut out by {}", model.file.display())));
+    let mut names = Vec::new();
+    let confirmed = estimate::confirmed(views, &config.hints).unwrap_or_default();
+    for (view, keep) in views.iter_mut().zip(confirmed) {
+        if let Some(keep) = keep {
+            set_alpha(&mut view.image, &keep);
+            names.push(view.name.clone());
+        }
+    }
+    if !names.is_empty() {
+        notes.push(Note::changed(format!("what only {} marked beside the object was taken away", names.join(", "))));
+    }
+    Ok(())
+}
+
+/// Alpha where there is one, else a plain background; none where neither is there and nobody asked for it.
+fn by_alpha_or_backdrop(
+    views: &mut [View],
+    told: &[Told],
+    config: &LoadConfig,
+    notes: &mut Vec<Note>,
+) -> Result<Option<MaskKind>, SceneError> {
+    let with_alpha = told.iter().filter(|p| p.alpha).count();
+    let tried: Result<Vec<Option<RgbaImage>>, SceneError> = views
+        .par_iter()
+        .zip(told)
+        .map(|(view, picture)| match (picture.alpha, &config.masks) {
+            (true, MaskSource::Auto | MaskSource::Alpha) => Ok(None),
+            (false, MaskSource::Alpha) => Err(SceneError::Mask {
+                name: view.name.clone(),
+                expected: "an alpha channel".into(),
+                found: "an opaque image".into(),
+            }),
+            _ => plain(view).map(Some),
+        })
+        .collect();
+    match tried {
+        Ok(images) => {
+            let cut = images.iter().flatten().count();
+            for (view, image) in views.iter_mut().zip(images) {
+                if let Some(image) = image {
+                    view.image = image;
+                }
+            }
+            if cut > 0 {
+                notes.push(Note::understood(format!("the plain background of {cut} photos was cut away")));
+            }
+            Ok(Some(if cut == views.len() { MaskKind::Plain } else { MaskKind::Alpha }))
+        }
+        Err(error) if config.masks != MaskSource::Auto || with_alpha > 0 => Err(error),
+        Err(_) => Ok(None),
+    }
+}
+
+#[cfg(feature = "mask-model")]
+fn network(model: &MaskModel, views: &[View]) -> Result<Vec<Vec<u8>>, SceneError> {
+    crate::network::masks(model, views)
+}
+
+#[cfg(not(feature = "mask-model"))]
+fn network(model: &MaskModel, _: &[View]) -> Result<Vec<Vec<u8>>, SceneError> {
+    let expected = format!("a program built with --features mask-model, to run {}", model.file.display());
+    Err(Invalid::new("--mask-model", expected, "one without").into())
+}
+
+pub(super) fn set_alpha(image: &mut RgbaImage, alpha: &[u8]) {
+    for (pixel, alpha) in image.pixels_mut().zip(alpha) {
+        // What the lens did not show stays empty.
+        pixel[3] = (u16::from(pixel[3]) * u16::from(*alpha) / 255) as u8;
+        if pixel[3] == 0 {
+            *pixel = Rgba([0; 4]);
+        }
+    }
+}

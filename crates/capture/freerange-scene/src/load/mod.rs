@@ -1,0 +1,490 @@
+//! From cameras and files to views: pictures decoded, turned, freed from distortion, cut out.
+
+mod aim;
+mod cut;
+mod masks;
+mod picture;
+
+pub use cut::cut;
+pub(crate) use picture::size_of;
+
+use crate::camera::{
+    Lens, Up, View,
+    image_ops::{resize_area, shrunk_size},
+    scene::{cut_out, fills_frame},
+};
+use crate::{
+    SceneError,
+    error::In,
+    estimate::{self, Estimate, Hints},
+    read::{Cameras, IMAGES, Photo, inside, listed},
+};
+use aim::Aim;
+use cut::{Told, cut_all, plain, set_alpha};
+use freerange_util::{Invalid, IoError, Note, beside, persist};
+use image::{GrayImage, Luma, RgbaImage};
+use masks::{MaskFiles, Meaning, mask_files, meaning};
+use picture::{Picture, coloured, gray, picture};
+use rayon::prelude::*;
+use std::{
+    collections::{BTreeSet, HashSet},
+    path::{Path, PathBuf},
+};
+
+/// All views of a scene together, in pixels (4 bytes each).
+const LARGEST_SCENE: u64 = 1 << 30;
+/// Photos that are decoded at once, in pixels, but for one: some 8 bytes each.
+const LARGEST_AT_ONCE: u64 = 1 << 28;
+/// What a rim of nothing leaves of a photo at least.
+const RIM_FILL: f64 = 0.6;
+
+/// Where masks come from.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum MaskSource {
+    /// Mask files that the cameras' file names or that lie in `masks` beside the images; else the images' alpha; else one plain colour
+    /// behind the object; else [`MaskSource::Estimate`].
+    #[default]
+    Auto,
+    /// The images' alpha.
+    Alpha,
+    /// What is not the plain colour of the image's border.
+    Plain,
+    /// Files in this folder: white is the object.
+    Files(PathBuf),
+    /// Poses and colours alone ([`estimate`]).
+    Estimate,
+    /// A network of the user's own.
+    Model(MaskModel),
+}
+
+/// A segmentation network: an ONNX file with one input, `[1, 3, height, width]`, whose first output is the object's share of each pixel,
+/// `[1, 1, height, width]`: from 0 to 1, or log odds if any number is beyond that. Photos are scaled to its size, whatever their shape; to
+/// 320 x 320 where it takes any.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct MaskModel {
+    /// The file.
+    pub file: PathBuf,
+    /// What it takes for pixels.
+    pub pixels: PixelRange,
+}
+
+/// What networks take for the red, green and blue of a pixel.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum PixelRange {
+    /// 0 to 1, minus ImageNet's mean, divided by its standard deviation: U2-Net, BiRefNet and most others.
+    #[default]
+    Imagenet,
+    /// 0 to 1.
+    Unit,
+    /// -0.5 to 0.5: IS-Net.
+    Centered,
+    /// -1 to 1.
+    Signed,
+}
+
+impl PixelRange {
+    /// All, by their names in options.
+    pub const ALL: [(&'static str, Self); 4] =
+        [("imagenet", Self::Imagenet), ("unit", Self::Unit), ("centered", Self::Centered), ("signed", Self::Signed)];
+
+    /// What is subtracted from values of 0 to 1, and what they are divided by then; red, green, blue.
+    pub fn mean_and_deviation(self) -> ([f32; 3], [f32; 3]) {
+        match self {
+            Self::Imagenet => ([0.485, 0.456, 0.406], [0.229, 0.224, 0.225]),
+            Self::Unit => ([0.0; 3], [1.0; 3]),
+            Self::Centered => ([0.5; 3], [1.0; 3]),
+            Self::Signed => ([0.5; 3], [0.5; 3]),
+        }
+    }
+}
+
+/// How the object was told from the rest.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum MaskKind {
+    /// Alpha, or in some images a plain background.
+    Alpha,
+    /// Plain backgrounds.
+    Plain,
+    /// Mask files.
+    Files,
+    /// Poses and colours.
+    Estimate,
+    /// A network.
+    Model,
+}
+
+/// How photos become views.
+#[derive(Clone, Debug)]
+pub struct LoadConfig {
+    /// Where masks come from.
+    pub masks: MaskSource,
+    /// In mask files, black is the object.
+    pub invert_masks: bool,
+    /// Larger photos are made smaller: the longer side in pixels, at most.
+    pub max_side: u32,
+    /// What is known of the object's place, for [`MaskSource::Estimate`].
+    pub hints: Hints,
+}
+
+impl Default for LoadConfig {
+    fn default() -> Self {
+        Self { masks: MaskSource::Auto, invert_masks: false, max_side: 1024, hints: Hints::default() }
+    }
+}
+
+/// Photos as views: undistorted, with pinhole cameras, alpha the object's mask.
+#[derive(Clone, Debug)]
+pub struct Loaded {
+    /// The views to reconstruct from.
+    pub views: Vec<View>,
+    /// Which of [`Cameras::photos`] each view is.
+    pub photos: Vec<usize>,
+    /// The whole photo of each view, undistorted.
+    pub whole: Vec<RgbaImage>,
+    /// Further views, only compared with.
+    pub further: Vec<View>,
+    /// How the object was told from the rest.
+    pub masks: MaskKind,
+    /// What came with masks that were estimated.
+    pub estimate: Option<Estimate>,
+    /// What was understood, assumed, changed or left out, for the user to read.
+    pub notes: Vec<Note>,
+}
+
+/// Loads the images of `cameras`, and cuts the object out.
+///
+/// An image keeps the orientation in which it is stored, as the programs that write cameras read it; only where its camera has the turned
+/// size, or is that of no file, it is turned as its EXIF data says.
+pub fn load(cameras: &Cameras, config: &LoadConfig) -> Result<Loaded, SceneError> {
+    let file = cameras.files.first().cloned().unwrap_or_default();
+    let (inputs, further): (Vec<usize>, Vec<usize>) =
+        (0..cameras.photos.len()).partition(|i| !cameras.photos[*i].further);
+    if inputs.len() < 2 {
+        return Err(SceneError::TooFew { file, expected: 2, found: inputs.len() });
+    }
+    let config = &LoadConfig { hints: cameras.local(config.hints), ..config.clone() };
+    let mut notes = Vec::new();
+    let masks = mask_files(cameras, config, &mut notes)?;
+    let aim = Aim::of(cameras, &masks.of, config)?;
+    check_pixels(cameras, config)?;
+    let mut pictures = pictures_of(cameras, &inputs, &masks, aim.as_ref(), config)?;
+    tell(&pictures, cameras, &inputs, &mut notes);
+    let usable = look_at_masks(cameras, &mut pictures, &masks, config, &mut notes)?;
+    without_rims(&mut pictures, config, &mut notes);
+    let mut names = vec![String::new(); cameras.photos.len()];
+    for group in [&inputs, &further] {
+        for (i, name) in group.iter().zip(short_names(&cameras.photos, group)) {
+            names[*i] = name;
+        }
+    }
+    let told: Vec<Told> = pictures.iter_mut().map(|p| Told { mask: p.mask.take(), alpha: p.alpha }).collect();
+    let mut views: Vec<View> = inputs
+        .iter()
+        .zip(pictures)
+        .map(|(i, p)| View { name: names[*i].clone(), camera: p.camera, image: p.image })
+        .collect();
+    let whole: Vec<RgbaImage> = views.iter().map(|v| v.image.clone()).collect();
+    let first = views[0].camera.center();
+    if views.iter().all(|v| v.camera.center().distance(first) <= 1e-6 * (1e-6 + first.length())) {
+        let found = format!("all {} cameras stand at one point; expected views from different places", views.len());
+        return Err(In(&file).malformed("", found));
+    }
+    let (kind, estimate) = cut_all(&mut views, &told, config, &mut notes)?;
+    let mut compared = pictures_of(cameras, &further, &masks, aim.as_ref(), config)?;
+    if usable {
+        compared.iter_mut().for_each(Picture::only_usable);
+    }
+    without_rims(&mut compared, config, &mut Vec::new());
+    let further = further_views(compared, &further, &names, &mut notes);
+    Ok(Loaded { views, photos: inputs, whole, further, masks: kind, estimate, notes })
+}
+
+/// Refuses photos, those that are only compared with among them, that together are larger than a scene may be; before any of
+/// them is decoded.
+fn check_pixels(cameras: &Cameras, config: &LoadConfig) -> Result<(), SceneError> {
+    let mut pixels = 0;
+    for photo in &cameras.photos {
+        let (w, h) = shrunk_size(size_of(&photo.image)?, config.max_side);
+        pixels += u64::from(w) * u64::from(h);
+    }
+    if pixels <= LARGEST_SCENE {
+        return Ok(());
+    }
+    let expected =
+        format!("photos of at most {LARGEST_SCENE} pixels together; fewer of them, or a smaller --max-resolution");
+    Err(Invalid::new("--max-resolution", expected, pixels).into())
+}
+
+/// The photos of `which`: as many at once as their whole files fit into [`LARGEST_AT_ONCE`].
+fn pictures_of(
+    cameras: &Cameras,
+    which: &[usize],
+    masks: &MaskFiles,
+    aim: Option<&Aim>,
+    config: &LoadConfig,
+) -> Result<Vec<Picture>, SceneError> {
+    let mut all = Vec::with_capacity(which.len());
+    let mut rest = which;
+    while !rest.is_empty() {
+        let (mut count, mut pixels) = (0, 0);
+        while count < rest.len() {
+            let (w, h) = size_of(&cameras.photos[rest[count]].image)?;
+            pixels += u64::from(w) * u64::from(h);
+            if count > 0 && pixels > LARGEST_AT_ONCE {
+                break;
+            }
+            count += 1;
+        }
+        let (now, later) = rest.split_at(count);
+        let one = |i: &usize| picture(&cameras.photos[*i], masks.of[*i].as_deref(), aim, config);
+        all.extend(first_error(now.par_iter().map(one).collect())?);
+        rest = later;
+    }
+    Ok(all)
+}
+
+/// What is wrong with the first photo that has anything: Rayon would tell of the one that was looked at first.
+fn first_error<T>(results: Vec<Result<T, SceneError>>) -> Result<Vec<T>, SceneError> {
+    results.into_iter().collect()
+}
+
+/// Refuses mask files that look inverted, and takes those that say what may be looked at for just that; whether they do.
+fn look_at_masks(
+    cameras: &Cameras,
+    pictures: &mut [Picture],
+    masks: &MaskFiles,
+    config: &LoadConfig,
+    notes: &mut Vec<Note>,
+) -> Result<bool, SceneError> {
+    if pictures.iter().any(|p| p.mask.is_none()) {
+        return Ok(false);
+    }
+    let folders: Vec<String> = masks.folders.iter().map(|f| cameras.short(f)).collect();
+    let whence = match folders.is_empty() {
+        true => "the cameras' file".to_owned(),
+        false => format!("the folder {}", folders.join(", ")),
+    };
+    let given = matches!(config.masks, MaskSource::Files(_));
+    let meaning = meaning(pictures);
+    let mean = pictures.iter().map(|p| p.mask_covers.1).sum::<f64>() / pictures.len() as f64;
+    if meaning == Meaning::Inverted {
+        return Err(SceneError::Mask {
+            name: format!("the masks of {whence}"),
+            expected: "masks in which the object is white".into(),
+            found: "masks that look inverted: white all along the border, and what is black is one thing in space; --invert-masks if black \
+                    is the object"
+                .into(),
+        });
+    }
+    if meaning == Meaning::Usable && !given {
+        notes.push(Note::warning(format!(
+            "the masks of {whence} cover {:.0} % of the photos and most of their border: they are taken to say which pixels may be used, not \
+             which are the object (--masks FOLDER if they do)",
+            100.0 * mean
+        )));
+        pictures.iter_mut().for_each(Picture::only_usable);
+        return Ok(true);
+    }
+    if meaning == Meaning::Usable {
+        notes.push(Note::warning(format!(
+            "the masks of {whence} cover {:.0} % of the photos and most of their border: are they outlines of the object?",
+            100.0 * mean
+        )));
+    }
+    notes.push(Note::understood(format!("masks are read from files, those of {whence}")));
+    Ok(false)
+}
+
+/// Transparency that is the same in all photos, and only a rim, is what undistorting them left; it is not the object's outline.
+fn without_rims(pictures: &mut [Picture], config: &LoadConfig, notes: &mut Vec<Note>) {
+    if config.masks == MaskSource::Alpha || !pictures.iter().any(|p| p.alpha) {
+        return;
+    }
+    let shown = |p: &Picture| p.image.pixels().map(|p| p[3] >= 128).collect::<Vec<bool>>();
+    let first = shown(&pictures[0]);
+    let size = pictures[0].image.dimensions();
+    let same = |p: &Picture| {
+        p.image.dimensions() == size
+            && p.image.pixels().zip(&first).filter(|(p, s)| (p[3] >= 128) != **s).count() <= first.len() / 500
+    };
+    let all_same = pictures.len() > 1 && pictures.iter().all(same) && fills_frame(&first, size.0, size.1, RIM_FILL);
+    let mut count = 0;
+    for p in pictures.iter_mut().filter(|p| p.alpha) {
+        let (w, h) = p.image.dimensions();
+        // Or what it leaves is the object before a plain backdrop.
+        p.alpha = !(all_same || fills_frame(&shown(p), w, h, RIM_FILL) && cut_out(&p.image).is_ok());
+        count += usize::from(!p.alpha);
+    }
+    if count > 0 {
+        notes.push(Note::assumed(format!(
+            "the transparent rim of {count} photos is what undistorting them left, not the object's outline (--masks alpha if it is)"
+        )));
+    }
+}
+
+/// Views to compare with; those that nothing cuts out are left out.
+fn further_views(pictures: Vec<Picture>, which: &[usize], names: &[String], notes: &mut Vec<Note>) -> Vec<View> {
+    let cut: Vec<Result<View, String>> = pictures
+        .into_par_iter()
+        .zip(which)
+        .map(|(p, i)| {
+            let mut view = View { name: names[*i].clone(), camera: p.camera, image: p.image };
+            if let Some(mask) = &p.mask {
+                set_alpha(&mut view.image, mask.as_raw());
+            } else if !p.alpha {
+                view.image = plain(&view).map_err(|_| view.name.clone())?;
+            }
+            Ok(view)
+        })
+        .collect();
+    let lost: Vec<String> = cut.iter().filter_map(|c| c.as_ref().err().cloned()).collect();
+    if !lost.is_empty() {
+        notes.push(Note::dropped(format!(
+            "{} photos to compare with have no mask and are left out: {}",
+            lost.len(),
+            listed(&lost)
+        )));
+    }
+    cut.into_iter().flatten().collect()
+}
+
+/// The files that [`load`] reads: of cameras, photos and masks; each once, sorted. None of them is opened.
+pub fn files(cameras: &Cameras, config: &LoadConfig) -> Result<Vec<PathBuf>, SceneError> {
+    let masks = mask_files(cameras, config, &mut Vec::new())?.of.into_iter().flatten();
+    let photos = cameras.photos.iter().map(|p| p.image.clone());
+    let network = match &config.masks {
+        MaskSource::Model(model) => Some(model.file.clone()),
+        _ => None,
+    };
+    let files = cameras.files.iter().cloned().chain(photos).chain(masks).chain(network);
+    let all: BTreeSet<PathBuf> = files.collect();
+    Ok(all.into_iter().collect())
+}
+
+/// Names without folders and extensions where these differ, else with both.
+fn short_names(photos: &[Photo], group: &[usize]) -> Vec<String> {
+    let short = |i: &usize| {
+        let name = &photos[*i].name;
+        let name = name.rsplit(['/', '\\']).next().unwrap_or(name);
+        match name.rsplit_once('.') {
+            Some((stem, end)) if IMAGES.iter().any(|e| end.eq_ignore_ascii_case(e)) => stem.to_owned(),
+            _ => name.to_owned(),
+        }
+    };
+    let names: Vec<String> = group.iter().map(short).collect();
+    let different: HashSet<&String> = names.iter().collect();
+    if different.len() == names.len() {
+        return names;
+    }
+    group.iter().map(|i| format!("{i:03}-{}", photos[*i].name.replace(['/', '\\'], "_"))).collect()
+}
+
+fn tell(pictures: &[Picture], cameras: &Cameras, inputs: &[usize], notes: &mut Vec<Note>) {
+    let lenses = inputs.iter().filter(|i| cameras.photos[**i].lens != Lens::Ideal).count();
+    if lenses > 0 {
+        notes.push(Note::changed(format!("lens distortion was removed from {lenses} photos")));
+    }
+    let aimed = pictures.iter().filter(|p| p.aimed).count();
+    if aimed > 0 {
+        notes.push(Note::changed(format!(
+            "{aimed} photos of wide lenses are seen by a pinhole that looks at the object"
+        )));
+    }
+    let turned = pictures.iter().filter(|p| p.turned).count();
+    if turned > 0 {
+        notes.push(Note::changed(format!("{turned} photos were turned as their EXIF data says")));
+    }
+    let converted = pictures.iter().filter(|p| p.converted).count();
+    if converted > 0 {
+        notes.push(Note::changed(format!("the colors of {converted} photos were converted to sRGB")));
+    }
+    if let Some(p) = pictures.iter().find(|p| !p.aimed && p.image.dimensions() != p.size) {
+        let (w, h) = p.image.dimensions();
+        notes.push(Note::changed(format!("photos are used at {w} x {h} pixels and alike, smaller than they are")));
+    }
+    let wide = pictures.iter().filter(|p| p.size.0 > p.size.1).count();
+    let high = pictures.iter().filter(|p| p.size.0 < p.size.1).count();
+    if wide > 0 && high > 0 {
+        notes.push(Note::understood(format!("{wide} photos are wide, {high} are high")));
+    }
+}
+
+/// Writes masks as files, `NAME.png` for each photo with its whole name, as COLMAP has them and [`MaskSource::Files`] reads them: white is
+/// the object, in the photo's own pixels with its lens. Returns their paths.
+pub fn write_masks(folder: &Path, cameras: &Cameras, loaded: &Loaded) -> Result<Vec<PathBuf>, SceneError> {
+    let names = mask_names(cameras, &loaded.photos);
+    let mut written = Vec::new();
+    for ((view, i), name) in loaded.views.iter().zip(&loaded.photos).zip(names) {
+        let mask = mask_as_taken(&cameras.photos[*i], view)?;
+        let path = inside(folder, &name).unwrap_or_else(|| folder.join(format!("{}.png", view.name)));
+        let done = std::fs::create_dir_all(path.parent().unwrap_or(folder)).and_then(|()| {
+            let temporary = beside(&path)?;
+            mask.write_to(&mut std::io::BufWriter::new(&temporary), image::ImageFormat::Png)
+                .map_err(std::io::Error::other)?;
+            persist(temporary, &path)
+        });
+        done.map_err(|e| SceneError::Write(IoError::at(&path)(e)))?;
+        written.push(path);
+    }
+    Ok(written)
+}
+
+/// `NAME.png`: a photo's own name where it has an extension, else its file's; with the file's folder where files have one name.
+fn mask_names(cameras: &Cameras, which: &[usize]) -> Vec<String> {
+    let file = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let name = |i: &usize| {
+        let photo = &cameras.photos[*i];
+        match Path::new(&photo.name).extension() {
+            Some(_) => photo.name.clone(),
+            None => file(&photo.image),
+        }
+    };
+    let mut names: Vec<String> = which.iter().map(name).collect();
+    let different: HashSet<&String> = names.iter().collect();
+    if different.len() < names.len() {
+        names = which
+            .iter()
+            .map(|i| {
+                let image = &cameras.photos[*i].image;
+                format!("{}/{}", file(image.parent().unwrap_or(Path::new(""))), file(image))
+            })
+            .collect();
+    }
+    names.into_iter().map(|name| format!("{name}.png")).collect()
+}
+
+/// A view's mask in its photo's own pixels.
+fn mask_as_taken(photo: &Photo, view: &View) -> Result<GrayImage, SceneError> {
+    let (w, h) = view.image.dimensions();
+    let alpha = GrayImage::from_fn(w, h, |x, y| Luma([view.image.get_pixel(x, y)[3]]));
+    let mut mask = coloured(&alpha);
+    let (mut full_w, mut full_h) = size_of(&photo.image)?;
+    // A photo that was turned, as its camera knows no other.
+    if photo.camera((full_w, full_h)).is_err() || photo.is_upright() && (full_w > full_h) != (w > h) && full_w != full_h
+    {
+        (full_w, full_h) = (full_h, full_w);
+    }
+    if photo.lens != Lens::Ideal {
+        // In the view's own detail.
+        let (small_w, small_h) = shrunk_size((full_w, full_h), w.max(h).max(if w == h { 1024 } else { 0 }));
+        let taken = photo.camera((small_w, small_h)).or_else(|_| photo.camera((full_w, full_h)))?;
+        mask = photo.lens.taken_of(&mask, &view.camera, &taken);
+    }
+    Ok(gray(&resize_area(&mask, full_w, full_h)))
+}
+
+/// Which way is up where nobody says so, and what the user should know of it: +z where that is the format's rule, else where the table faces,
+/// else the cameras' own.
+pub fn up_of(cameras: &Cameras, loaded: &Loaded) -> (Up, Option<Note>) {
+    if !cameras.any_up {
+        return (Up::Z, None);
+    }
+    let table = match &loaded.estimate {
+        Some(estimate) => estimate.up,
+        None => estimate::table_faces(&loaded.views, &loaded.whole),
+    };
+    let whence = if table.is_some() { "what the object stands on" } else { "the cameras" };
+    let note = Note::assumed(format!("up is taken from {whence}; --up says otherwise"));
+    (table.map_or(Up::Cameras, Up::Direction), Some(note))
+}

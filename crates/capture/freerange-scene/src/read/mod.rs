@@ -1,0 +1,513 @@
+//! Cameras as other programs write them: which program's they are, and one reader for each.
+//!
+//! Every reader takes bytes that nobody has checked. Counts claimed by a file are believed only as far as the bytes go that are
+//! really there, and what cannot be used is refused with file, place and field.
+
+pub mod colmap;
+pub mod colmap_frames;
+pub mod metashape;
+pub mod opf;
+mod origin;
+mod photos;
+pub mod polycam;
+pub mod realitycapture;
+mod transforms;
+pub mod turntable;
+
+use crate::camera::{
+    Camera, Lens,
+    scene::{IMAGE_EXTENSIONS, LARGEST_COORDINATE, nearest_rotation, unreadable_kind},
+};
+use crate::{SceneError, error::In};
+use freerange_util::{Invalid, Note};
+use glam::{DMat3, DMat4, DVec3};
+use photos::Photos;
+pub(crate) use photos::listed;
+use std::{
+    collections::{BTreeSet, HashMap},
+    io::Read,
+    path::{Path, PathBuf},
+};
+pub use turntable::{Turntable, in_order, photos_in};
+
+/// Largest image side accepted, in pixels.
+pub(crate) const LARGEST_SIDE: u32 = 16384;
+/// Largest file of cameras accepted, in bytes: COLMAP's with all keypoints of thousands of photos.
+const LARGEST_FILE: u64 = 1 << 30;
+/// Photos of one scene, at most.
+pub(crate) const LARGEST_SCENE: usize = 10_000;
+/// Image files that are taken without being named.
+pub(crate) const IMAGES: [&str; 4] = IMAGE_EXTENSIONS;
+
+/// Whose cameras they are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Format {
+    /// `transforms.json` of NeRF tools and nerfstudio.
+    Transforms,
+    /// COLMAP's `cameras` and `images`, binary or text.
+    Colmap,
+    /// Polycam's raw export: one JSON file per photo.
+    Polycam,
+    /// Agisoft Metashape's camera export, XML.
+    Metashape,
+    /// RealityCapture's (RealityScan's) registration export, CSV.
+    Realitycapture,
+    /// Pix4D's Open Photogrammetry Format: `project.opf`.
+    Opf,
+    /// None: photos at even steps around the object.
+    Turntable,
+}
+
+impl Format {
+    /// All that a folder can be found to be.
+    pub const ALL: [Self; 6] =
+        [Self::Transforms, Self::Colmap, Self::Polycam, Self::Metashape, Self::Realitycapture, Self::Opf];
+
+    /// As in options and reports.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Transforms => "transforms",
+            Self::Colmap => "colmap",
+            Self::Polycam => "polycam",
+            Self::Metashape => "metashape",
+            Self::Realitycapture => "realitycapture",
+            Self::Opf => "opf",
+            Self::Turntable => "turntable",
+        }
+    }
+}
+
+/// How large the camera's image is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Intrinsics {
+    /// In pixels of an image of known size.
+    Pixels(Camera),
+    /// Relative to the image's longer side, for formats that do not tell sizes: focal length, and offset of the principal point
+    /// from the middle.
+    Relative {
+        /// Focal length divided by the longer side.
+        focal: f64,
+        /// Principal point minus the middle, x and y, divided by the longer side.
+        offset: [f64; 2],
+        /// Rigid transform from world to camera.
+        world_to_camera: DMat4,
+        /// Whether the camera is that of the photo as viewers show it, turned by its EXIF data, instead of its stored pixels.
+        upright: bool,
+    },
+}
+
+/// A photo with its camera, as a reader found it; the image itself has not been looked at.
+#[derive(Clone, Debug)]
+pub struct Photo {
+    /// File name as the format gives it, folders included.
+    pub name: String,
+    /// The image file.
+    pub image: PathBuf,
+    /// The mask file that the format names.
+    pub mask: Option<PathBuf>,
+    /// Its camera, without the lens.
+    pub intrinsics: Intrinsics,
+    /// Its lens.
+    pub lens: Lens,
+    /// Only compared with, not reconstructed from.
+    pub further: bool,
+}
+
+impl Intrinsics {
+    /// From world to camera.
+    pub fn world_to_camera(&self) -> DMat4 {
+        match self {
+            Self::Pixels(camera) => camera.world_to_camera,
+            Self::Relative { world_to_camera, .. } => *world_to_camera,
+        }
+    }
+
+    fn world_to_camera_mut(&mut self) -> &mut DMat4 {
+        match self {
+            Self::Pixels(camera) => &mut camera.world_to_camera,
+            Self::Relative { world_to_camera, .. } => world_to_camera,
+        }
+    }
+}
+
+impl Photo {
+    /// Whether its camera is that of the photo as viewers show it.
+    pub(crate) fn is_upright(&self) -> bool {
+        matches!(self.intrinsics, Intrinsics::Relative { upright: true, .. })
+    }
+
+    /// The camera for an image of `size` (width, height), which must have the shape that the camera was made for.
+    pub fn camera(&self, size: (u32, u32)) -> Result<Camera, SceneError> {
+        let (width, height) = size;
+        match self.intrinsics {
+            Intrinsics::Pixels(camera) => {
+                let expected = (camera.width, camera.height);
+                // The same shape, up to one pixel of rounding.
+                let (a, b) = (u64::from(width) * u64::from(expected.1), u64::from(height) * u64::from(expected.0));
+                if a.abs_diff(b) > u64::from(expected.0.max(expected.1)) {
+                    let file = self.image.clone();
+                    return Err(SceneError::Size { file, of: "its camera's", expected, found: size });
+                }
+                Ok(camera.resized(width, height))
+            }
+            Intrinsics::Relative { focal, offset, world_to_camera, .. } => {
+                let side = f64::from(width.max(height));
+                let (cx, cy) = (0.5 * f64::from(width) + side * offset[0], 0.5 * f64::from(height) + side * offset[1]);
+                Ok(Camera { width, height, fx: side * focal, fy: side * focal, cx, cy, world_to_camera })
+            }
+        }
+    }
+}
+
+/// What a reader found.
+#[derive(Clone, Debug)]
+pub struct Cameras {
+    /// Whose they are.
+    pub format: Format,
+    /// The photos, in the order of the file.
+    pub photos: Vec<Photo>,
+    /// The files that were read.
+    pub files: Vec<PathBuf>,
+    /// The scene's own folder: nothing outside of it is taken without being named.
+    pub root: PathBuf,
+    /// What was subtracted from all positions, in the scene's frame: cameras on maps lie where 32 bits do not resolve an object.
+    pub origin: DVec3,
+    /// Nothing says which way is up: the frame is the one that a reconstruction happened to have.
+    pub any_up: bool,
+    /// What was understood or passed over, for the user to read.
+    pub notes: Vec<Note>,
+}
+
+impl Cameras {
+    /// A path for the user to read: from the scene's folder on, where it lies there.
+    pub(crate) fn short(&self, path: &Path) -> String {
+        path.strip_prefix(&self.root).unwrap_or(path).display().to_string()
+    }
+
+    /// What a reader found; the rest is added by [`cameras_with`].
+    fn new(format: Format, photos: Vec<Photo>, files: Vec<PathBuf>, notes: Vec<Note>) -> Self {
+        let any_up = matches!(format, Format::Colmap | Format::Metashape);
+        Self { format, photos, files, root: PathBuf::new(), origin: DVec3::ZERO, any_up, notes }
+    }
+}
+
+/// How cameras are read.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ReadConfig {
+    /// Decides where a folder could be two things; without it that is an error that names both.
+    pub format: Option<Format>,
+    /// The folder holds photos without any cameras, taken like this.
+    pub turntable: Option<Turntable>,
+    /// The folder of the photos, where they do not lie where the format has them.
+    pub images: Option<PathBuf>,
+}
+
+/// [`cameras_with`] with all photos in their usual places.
+pub fn cameras(path: &Path, format: Option<Format>, turntable: Option<&Turntable>) -> Result<Cameras, SceneError> {
+    cameras_with(path, &ReadConfig { format, turntable: turntable.copied(), images: None })
+}
+
+/// Reads the cameras of a scene: a folder, or a file of one of the formats.
+pub fn cameras_with(path: &Path, config: &ReadConfig) -> Result<Cameras, SceneError> {
+    let metadata = std::fs::metadata(path).map_err(|e| In(path).read(e))?;
+    let (format, images) = (config.format, config.images.as_deref());
+    if let Some(folder) = images {
+        entries(folder)?;
+    }
+    if let Some(turntable) = &config.turntable {
+        let folder = images.unwrap_or(path);
+        return Ok(Cameras { root: folder.into(), ..turntable::read(folder, turntable)? });
+    }
+    let mut cameras = if metadata.is_dir() {
+        let mut found: Vec<(Format, PathBuf)> = Vec::new();
+        for candidate in Format::ALL {
+            if format.is_none_or(|f| f == candidate) {
+                found.extend(look_for(path, candidate)?.map(|file| (candidate, file)));
+            }
+        }
+        match found.as_slice() {
+            [] => return Err(nothing(path, format)?),
+            [(format, file)] => read(*format, file, images)?,
+            [(a, first), (b, second), ..] => {
+                return Err(SceneError::Ambiguous {
+                    folder: path.into(),
+                    first: format!("{} ({})", a.name(), first.display()),
+                    second: format!("{} ({})", b.name(), second.display()),
+                    advice: format!("say which with --cameras {} or --cameras {}", a.name(), b.name()),
+                });
+            }
+        }
+    } else {
+        let extension = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
+        let own = match extension.as_deref() {
+            Some("json") => Format::Transforms,
+            Some("xml") => Format::Metashape,
+            Some("csv") => Format::Realitycapture,
+            Some("opf") => Format::Opf,
+            Some("bin" | "txt") => Format::Colmap,
+            _ => {
+                let expected = "a folder, or a file .json, .xml, .csv or .opf";
+                return Err(In(path).field("", "file name", expected, path.display()));
+            }
+        };
+        if let Some(format) = format.filter(|f| *f != own) {
+            let expected = format!("{} for this file", own.name());
+            return Err(Invalid::new("--cameras", expected, format.name()).into());
+        }
+        match own {
+            Format::Colmap => colmap::read(path.parent().unwrap_or(Path::new("")), images)?,
+            own => read(own, path, images)?,
+        }
+    };
+    if cameras.photos.len() > LARGEST_SCENE {
+        let found = cameras.photos.len();
+        return Err(In(path).field("", "photos", &format!("at most {LARGEST_SCENE}"), found));
+    }
+    cameras.root = root_of(path, cameras.format);
+    different_files(&mut cameras)?;
+    if matches!(cameras.format, Format::Colmap | Format::Metashape | Format::Realitycapture | Format::Opf) {
+        cameras.notes.extend(without_camera(&cameras.photos));
+    }
+    cameras.settle_origin();
+    Ok(cameras)
+}
+
+/// The folder of the scene that `path` names: a folder, or a file in it, or a COLMAP model in its `sparse`.
+fn root_of(path: &Path, format: Format) -> PathBuf {
+    let absolute = std::fs::canonicalize(path).unwrap_or_else(|_| path.into());
+    let folder = if absolute.is_dir() { absolute.as_path() } else { absolute.parent().unwrap_or(Path::new("")) };
+    if format == Format::Colmap { colmap::scene_of(folder).into() } else { folder.into() }
+}
+
+/// A file is one photo: under two poses it is an error that names both; under one pose twice it is used once.
+fn different_files(cameras: &mut Cameras) -> Result<(), SceneError> {
+    let mut seen: HashMap<PathBuf, (String, bool, DMat4)> = HashMap::new();
+    let (mut twice, mut kept) = (0, Vec::with_capacity(cameras.photos.len()));
+    for photo in std::mem::take(&mut cameras.photos) {
+        let pose = photo.intrinsics.world_to_camera();
+        match seen.get(&photo.image) {
+            Some((other, _, others_pose)) if !others_pose.abs_diff_eq(pose, 1e-9) => {
+                return Err(SceneError::SameFile { file: photo.image, first: other.clone(), second: photo.name });
+            }
+            // One that is reconstructed from may be compared with as well.
+            Some((_, further, _)) if *further == photo.further => twice += 1,
+            _ => {
+                seen.insert(photo.image.clone(), (photo.name.clone(), photo.further, pose));
+                kept.push(photo);
+            }
+        }
+    }
+    cameras.photos = kept;
+    if twice > 0 {
+        cameras.notes.push(Note::dropped(format!("{twice} photos are listed twice with one pose, and used once")));
+    }
+    Ok(())
+}
+
+/// A note on the images that lie beside the photos and have no camera: programs do not manage to place them all.
+fn without_camera(photos: &[Photo]) -> Option<Note> {
+    let folders: BTreeSet<&Path> = photos.iter().filter_map(|p| p.image.parent()).collect();
+    let known: BTreeSet<&Path> = photos.iter().map(|p| p.image.as_path()).collect();
+    let there = folders.into_iter().filter_map(|f| entries(f).ok()).flatten();
+    let left: Vec<String> = there
+        .filter(|p| has_extension(p, &IMAGES) && !known.contains(p.as_path()))
+        .filter_map(|p| p.file_name().map(|n| n.to_string_lossy().into_owned()))
+        .collect();
+    let more = if left.len() > 6 { ", ..." } else { "" };
+    let names = left.iter().take(6).cloned().collect::<Vec<_>>().join(", ");
+    (!left.is_empty())
+        .then(|| Note::dropped(format!("{} photos have no camera and are left out: {names}{more}", left.len())))
+}
+
+fn read(format: Format, file: &Path, images: Option<&Path>) -> Result<Cameras, SceneError> {
+    match format {
+        Format::Transforms if images.is_some() => Err(Invalid::new(
+            "--images",
+            "cameras that do not say where their photos are (colmap, polycam, metashape, realitycapture, opf)",
+            "transforms.json, which does",
+        )
+        .into()),
+        Format::Transforms => transforms::read(file),
+        Format::Colmap => colmap::read(file, images),
+        Format::Polycam => polycam::read(file, images),
+        Format::Metashape => metashape::read(file, images),
+        Format::Realitycapture => realitycapture::read(file, images),
+        Format::Opf => opf::read(file, images),
+        Format::Turntable => {
+            let expected = "the format of a file; turntables have --turntable ELEVATION,FOV";
+            Err(Invalid::new("--cameras", expected, "turntable").into())
+        }
+    }
+}
+
+/// The file or folder that makes `folder` a scene of this format, if it is one.
+fn look_for(folder: &Path, format: Format) -> Result<Option<PathBuf>, SceneError> {
+    Ok(match format {
+        Format::Transforms => {
+            let there = ["transforms.json", "transforms_train.json"].iter().any(|n| folder.join(n).is_file());
+            there.then(|| folder.to_path_buf())
+        }
+        Format::Colmap => colmap::look_for(folder)?,
+        Format::Polycam => polycam::look_for(folder),
+        Format::Metashape => single(folder, "xml", metashape::is_one)?,
+        Format::Realitycapture => single(folder, "csv", realitycapture::is_one)?,
+        Format::Opf => single(folder, "opf", opf::is_one)?,
+        Format::Turntable => None,
+    })
+}
+
+/// The one file with this extension that looks right; several are an error that names two.
+fn single(folder: &Path, extension: &str, right: fn(&[u8]) -> bool) -> Result<Option<PathBuf>, SceneError> {
+    let mut found = Vec::new();
+    for path in entries(folder)? {
+        if has_extension(&path, &[extension]) && path.is_file() && right(&start_of(&path)?) {
+            found.push(path);
+        }
+    }
+    match found.as_slice() {
+        [first, second, ..] => Err(SceneError::Ambiguous {
+            folder: folder.into(),
+            first: first.display().to_string(),
+            second: second.display().to_string(),
+            advice: "name the file instead of the folder".into(),
+        }),
+        _ => Ok(found.pop()),
+    }
+}
+
+fn nothing(folder: &Path, format: Option<Format>) -> Result<SceneError, SceneError> {
+    let there = entries(folder)?;
+    if let Some((file, kind)) = there.iter().find_map(|f| Some((f, unreadable_kind(f)?))) {
+        return Ok(In(file).unreadable(kind));
+    }
+    let names: Vec<String> =
+        there.iter().take(8).filter_map(|p| p.file_name().map(|n| n.to_string_lossy().into_owned())).collect();
+    let found = if names.is_empty() { "an empty folder".into() } else { names.join(", ") };
+    Ok(match format {
+        Some(format) => {
+            let expected = format!("a folder with {} cameras", format.name());
+            Invalid::new("--cameras", expected, format!("{}: {found}", folder.display())).into()
+        }
+        None => SceneError::Nothing { folder: folder.into(), found },
+    })
+}
+
+/// What a folder holds, sorted by name.
+pub(crate) fn entries(folder: &Path) -> Result<Vec<PathBuf>, SceneError> {
+    let failed = |e| In(folder).read(e);
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(folder).map_err(failed)?.take(100_000) {
+        found.push(entry.map_err(failed)?.path());
+    }
+    found.sort();
+    Ok(found)
+}
+
+pub(crate) fn has_extension(path: &Path, extensions: &[&str]) -> bool {
+    path.extension().is_some_and(|e| extensions.iter().any(|known| e.eq_ignore_ascii_case(known)))
+}
+
+/// A whole file, if it is of a size that such files have.
+pub(crate) fn bytes_of(file: &Path) -> Result<Vec<u8>, SceneError> {
+    read_up_to(file, LARGEST_FILE + 1).and_then(|bytes| {
+        let found = bytes.len() as u64;
+        match found > LARGEST_FILE {
+            true => Err(SceneError::TooLarge { file: file.into(), limit: LARGEST_FILE, found }),
+            false => Ok(bytes),
+        }
+    })
+}
+
+fn start_of(file: &Path) -> Result<Vec<u8>, SceneError> {
+    read_up_to(file, 4096)
+}
+
+fn read_up_to(file: &Path, limit: u64) -> Result<Vec<u8>, SceneError> {
+    let failed = |e| In(file).read(e);
+    // A pipe or device would never end.
+    if !std::fs::metadata(file).map_err(failed)?.is_file() {
+        return Err(failed(std::io::Error::other("not a regular file")));
+    }
+    let mut bytes = Vec::new();
+    std::fs::File::open(file).and_then(|f| f.take(limit).read_to_end(&mut bytes)).map_err(failed)?;
+    Ok(bytes)
+}
+
+/// A file's text; the place of the first byte that is not UTF-8 is an error.
+pub(crate) fn text_of<'a>(file: &Path, bytes: &'a [u8]) -> Result<&'a str, SceneError> {
+    let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
+    std::str::from_utf8(bytes).map_err(|e| In(file).malformed(&format!("byte {}", e.valid_up_to()), "not UTF-8 text"))
+}
+
+/// Joins a path that a file names to a folder, if it stays inside: names are other people's.
+pub(crate) fn inside(folder: &Path, name: &str) -> Option<PathBuf> {
+    let name = name.replace('\\', "/");
+    let relative = Path::new(&name);
+    let normal = |c| matches!(c, std::path::Component::Normal(_) | std::path::Component::CurDir);
+    (!name.is_empty() && !name.contains('\0') && relative.components().all(normal)).then(|| folder.join(relative))
+}
+
+/// A camera in pixels, its numbers checked. `size` is width and height, `focal` and `principal` x and y.
+pub(crate) fn pinhole(
+    file: &Path,
+    place: &str,
+    size: (u64, u64),
+    focal: [f64; 2],
+    principal: [f64; 2],
+    world_to_camera: DMat4,
+) -> Result<Camera, SceneError> {
+    let side = |name: &str, v: u64| match v {
+        1..=16384 => Ok(v as u32),
+        _ => Err(In(file).field(place, name, &format!("a whole number from 1 to {LARGEST_SIDE}"), v)),
+    };
+    let (width, height) = (side("width", size.0)?, side("height", size.1)?);
+    for (i, (name, side)) in [("focal length", width), ("focal length", height)].into_iter().enumerate() {
+        let side = f64::from(side);
+        if !(1e-2 * side..=1e3 * side).contains(&focal[i]) {
+            let expected = format!("between 0.01 and 1000 times the image's {side} pixels");
+            return Err(In(file).field(place, name, &expected, focal[i]));
+        }
+        if !(-side..=2.0 * side).contains(&principal[i]) {
+            let expected = format!("a point near the image's {side} pixels");
+            return Err(In(file).field(place, ["cx", "cy"][i], &expected, principal[i]));
+        }
+    }
+    Ok(Camera { width, height, fx: focal[0], fy: focal[1], cx: principal[0], cy: principal[1], world_to_camera })
+}
+
+/// World to camera from the camera's axes (columns: right, down, forward, in world coordinates) and its centre.
+pub(crate) fn world_to_camera(file: &Path, place: &str, axes: DMat3, centre: DVec3) -> Result<DMat4, SceneError> {
+    let rotation = nearest_rotation(axes)
+        .map_err(|found| In(file).field(place, "rotation", "a rotation matrix", found))?
+        .transpose();
+    rigid(file, place, rotation, -(rotation * centre), centre)
+}
+
+/// World to camera from its rotation and translation; `centre` is the camera's.
+pub(crate) fn rigid(
+    file: &Path,
+    place: &str,
+    rotation: DMat3,
+    translation: DVec3,
+    centre: DVec3,
+) -> Result<DMat4, SceneError> {
+    if !(centre.abs().max_element() <= LARGEST_COORDINATE && translation.is_finite()) {
+        let expected = format!("a camera within {LARGEST_COORDINATE} of the origin");
+        return Err(In(file).field(place, "position", &expected, centre));
+    }
+    Ok(DMat4::from_cols(
+        rotation.x_axis.extend(0.0),
+        rotation.y_axis.extend(0.0),
+        rotation.z_axis.extend(0.0),
+        translation.extend(1.0),
+    ))
+}
+
+/// Distortion coefficients that a lens can have; those far beyond are errors of reading.
+pub(crate) fn coefficients(file: &Path, place: &str, names: &[&str], values: &[f64]) -> Result<(), SceneError> {
+    match names.iter().zip(values).find(|(_, v)| v.is_nan() || v.abs() > 100.0) {
+        Some((name, v)) => Err(In(file).field(place, name, "a distortion coefficient between -100 and 100", v)),
+        None => Ok(()),
+    }
+}

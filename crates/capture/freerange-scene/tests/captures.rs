@@ -1,0 +1,836 @@
+//! Captures as users have them: for each kind of fault that other programs' files had, files with it, and what they must come to.
+
+use freerange_scene::camera::{Camera, Lens, View};
+use freerange_scene::{
+    LoadConfig, Loaded, MaskKind, MaskSource, Note, NoteKind, SceneError,
+    estimate::Hints,
+    load,
+    read::{Cameras, Format, cameras},
+};
+use glam::{DMat3, DMat4, DVec3, DVec4};
+use image::{GrayImage, ImageEncoder, Luma, Rgb, RgbImage, Rgba, RgbaImage};
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+use tempfile::TempDir;
+
+const W: u32 = 96;
+const H: u32 = 72;
+/// The object is a ball about the origin.
+const BALL: f64 = 0.35;
+
+/// Camera number `i` of `n` around the ball.
+fn camera(i: usize, n: usize) -> Camera {
+    let a = std::f64::consts::TAU * i as f64 / n as f64;
+    Camera::look_at(DVec3::new(2.0 * a.cos(), 2.0 * a.sin(), 0.7), DVec3::ZERO, DVec3::Z, 0.8, W, H)
+}
+
+/// Whether the ray through a pixel hits the ball.
+fn hit(camera: &Camera, x: f64, y: f64) -> bool {
+    camera.center().cross(camera.ray_direction(x, y)).length() < BALL
+}
+
+/// What a camera sees: the red ball before `behind`.
+fn shot(camera: &Camera, behind: impl Fn(u32, u32) -> [u8; 4]) -> RgbaImage {
+    RgbaImage::from_fn(camera.width, camera.height, |x, y| match hit(camera, f64::from(x) + 0.5, f64::from(y) + 0.5) {
+        true => Rgba([200, 30, 20, 255]),
+        false => Rgba(behind(x, y)),
+    })
+}
+
+const WHITE: [u8; 4] = [252, 252, 252, 255];
+
+/// A background of many colors, other in each photo.
+fn busy(i: usize) -> impl Fn(u32, u32) -> [u8; 4] {
+    move |x, y| [(x as usize * 37 * (i + 1) % 200) as u8, (y as usize * 91 % 200) as u8, (40 * i) as u8, 255]
+}
+
+fn outline(camera: &Camera) -> GrayImage {
+    GrayImage::from_fn(camera.width, camera.height, |x, y| {
+        Luma([if hit(camera, f64::from(x) + 0.5, f64::from(y) + 0.5) { 255 } else { 0 }])
+    })
+}
+
+struct Capture(TempDir);
+
+impl Capture {
+    fn new() -> Self {
+        Self(tempfile::tempdir().unwrap())
+    }
+
+    fn at(&self, name: &str) -> PathBuf {
+        let path = self.0.path().join(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        path
+    }
+
+    /// A `transforms.json` of these cameras and files.
+    fn describe(&self, frames: &[(&str, Camera)], fields: Value) {
+        let flip = DMat4::from_diagonal(DVec4::new(1.0, -1.0, -1.0, 1.0));
+        let frames: Vec<Value> = frames
+            .iter()
+            .map(|(path, c)| {
+                let m = c.world_to_camera.inverse() * flip;
+                let rows: Vec<[f64; 4]> = (0..4).map(|i| m.row(i).to_array()).collect();
+                json!({"file_path": path, "transform_matrix": rows, "w": c.width, "h": c.height,
+                       "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy})
+            })
+            .collect();
+        let mut root = json!({"frames": frames});
+        root.as_object_mut().unwrap().extend(fields.as_object().unwrap().clone());
+        std::fs::write(self.at("transforms.json"), root.to_string()).unwrap();
+    }
+
+    /// A COLMAP model in text of these cameras and names, and what goes between images.
+    fn colmap(&self, folder: &str, frames: &[(&str, Camera)], between: &str) {
+        let (mut c, mut i) = (String::new(), String::new());
+        for (k, (name, camera)) in frames.iter().enumerate() {
+            let (q, t) = (
+                glam::DQuat::from_mat3(&DMat3::from_mat4(camera.world_to_camera)),
+                camera.world_to_camera.w_axis.truncate(),
+            );
+            let Camera { width, height, fx, fy, cx, cy, .. } = camera;
+            c += &format!("{k} PINHOLE {width} {height} {fx} {fy} {cx} {cy}\n");
+            i += &format!("{k} {} {} {} {} {} {} {} {k} {name}\n{between}", q.w, q.x, q.y, q.z, t.x, t.y, t.z);
+        }
+        std::fs::write(self.at(&format!("{folder}/cameras.txt")), c).unwrap();
+        std::fs::write(self.at(&format!("{folder}/images.txt")), i).unwrap();
+    }
+
+    fn read(&self) -> Cameras {
+        cameras(self.0.path(), None, None).unwrap()
+    }
+
+    fn load(&self) -> Result<Loaded, SceneError> {
+        load(&self.read(), &LoadConfig::default())
+    }
+}
+
+/// Share of a view's pixels that are on the wrong side.
+fn wrong(view: &View) -> f64 {
+    let c = &view.camera;
+    let off = view
+        .image
+        .enumerate_pixels()
+        .filter(|(x, y, p)| (p[3] >= 128) != hit(c, f64::from(*x) + 0.5, f64::from(*y) + 0.5));
+    off.count() as f64 / (f64::from(c.width) * f64::from(c.height))
+}
+
+fn assert_right(loaded: &Loaded, least: usize) {
+    assert!(loaded.views.len() >= least);
+    for view in loaded.views.iter().chain(&loaded.further) {
+        assert!(wrong(view) < 0.01, "{}: {:.3}", view.name, wrong(view));
+    }
+}
+
+#[track_caller]
+fn tells(notes: &[Note], kind: NoteKind, words: &[&str]) {
+    let found = notes.iter().any(|n| n.kind == kind && words.iter().all(|w| n.contains(w)));
+    assert!(found, "expected {kind:?} with {words:?} in {notes:?}");
+}
+
+#[track_caller]
+fn says<T>(result: Result<T, SceneError>, words: &[&str]) {
+    let text = result.err().expect("an error").to_string();
+    words.iter().for_each(|w| assert!(text.contains(w), "expected {w:?} in: {text}"));
+}
+
+const NAMES: [&str; 4] = ["images/a.png", "images/b.png", "images/c.png", "images/d.png"];
+
+fn ring() -> Vec<(&'static str, Camera)> {
+    NAMES.into_iter().enumerate().map(|(i, name)| (name, camera(i, 4))).collect()
+}
+
+#[test]
+fn rims_of_undistorted_photos_are_no_backdrop_and_no_object() {
+    // A lens that leaves an empty rim when it is undone; for inputs and for views compared with.
+    let capture = Capture::new();
+    let lens = Lens::brown([0.08, 0.0, 0.0, 0.0], [0.0; 2]);
+    for (i, (name, c)) in ring().iter().enumerate() {
+        let image = RgbaImage::from_fn(W, H, |x, y| {
+            let (u, v) = ((f64::from(x) + 0.5 - c.cx) / c.fx, (f64::from(y) + 0.5 - c.cy) / c.fy);
+            let (u, v) = lens.invert(u, v).unwrap();
+            Rgba(if hit(c, u * c.fx + c.cx, v * c.fy + c.cy) { [200, 30, 20, 255] } else { WHITE })
+        });
+        image.save(capture.at(name)).unwrap();
+        assert!(i < 4);
+    }
+    let fields = json!({"camera_model": "OPENCV", "k1": 0.08, "train_filenames": &NAMES[..3]});
+    capture.describe(&ring(), fields);
+    let loaded = capture.load().unwrap();
+    assert_eq!((loaded.masks, loaded.further.len()), (MaskKind::Plain, 1));
+    assert_right(&loaded, 3);
+    // The same rim, left by the user's own program: empty or black.
+    for rim in [[0, 0, 0, 0], [0, 0, 0, 255]] {
+        let capture = Capture::new();
+        for (name, c) in ring() {
+            let mut image = shot(&c, |_, _| WHITE);
+            for (x, y, p) in image.enumerate_pixels_mut() {
+                let (dx, dy) = (f64::from(x) / f64::from(W) - 0.5, f64::from(y) / f64::from(H) - 0.5);
+                if dx.abs().powi(4) + dy.abs().powi(4) > 0.055 {
+                    *p = Rgba(rim);
+                }
+            }
+            image.save(capture.at(name)).unwrap();
+        }
+        capture.describe(&ring(), json!({}));
+        assert_right(&capture.load().unwrap(), 4);
+    }
+}
+
+#[test]
+fn transparency_that_is_no_outline_is_not_taken_for_one() {
+    // One clear pixel; and a rim before a background of many colors, for which masks have to be found.
+    let capture = Capture::new();
+    for (name, c) in ring() {
+        let mut image = shot(&c, |_, _| WHITE);
+        image.put_pixel(40, 3, Rgba([252, 252, 252, 0]));
+        image.save(capture.at(name)).unwrap();
+    }
+    capture.describe(&ring(), json!({}));
+    let loaded = capture.load().unwrap();
+    assert_eq!(loaded.masks, MaskKind::Plain);
+    assert_right(&loaded, 4);
+    let capture = Capture::new();
+    for (i, (name, c)) in ring().iter().enumerate() {
+        let mut image = shot(c, busy(i));
+        image.enumerate_pixels_mut().filter(|(x, y, _)| *x < 2 || *y < 2).for_each(|(.., p)| p[3] = 0);
+        image.save(capture.at(name)).unwrap();
+    }
+    capture.describe(&ring(), json!({}));
+    // Not the whole photos as one object: what is found is judged, or refused.
+    match capture.load() {
+        Ok(loaded) => assert_eq!(loaded.masks, MaskKind::Estimate),
+        Err(e) => assert!(matches!(e, SceneError::NotCutOut { .. }), "{e}"),
+    }
+    // Outlines stay outlines.
+    let capture = Capture::new();
+    for (name, c) in ring() {
+        shot(&c, |_, _| [0; 4]).save(capture.at(name)).unwrap();
+    }
+    capture.describe(&ring(), json!({}));
+    let loaded = capture.load().unwrap();
+    assert_eq!(loaded.masks, MaskKind::Alpha);
+    assert_right(&loaded, 4);
+}
+
+#[test]
+fn cameras_far_from_the_origin_are_moved_to_one_that_is_written_down() {
+    for (place, units) in [
+        (DVec3::new(320_000.0, 740_000.0, 120.0), 1.0),
+        (DVec3::new(448_000.0, 5_411_000.0, 300.0), 1.0),
+        (DVec3::new(-2.7e6, -4.3e6, 3.9e6), 1.0),
+        (DVec3::new(5.0, 0.0, 0.0), 1e-3),
+    ] {
+        for colmap in [false, true] {
+            let capture = Capture::new();
+            let mut frames = ring();
+            for (name, c) in &mut frames {
+                shot(c, |_, _| [0; 4]).save(capture.at(name)).unwrap();
+                let r = DMat3::from_mat4(c.world_to_camera);
+                c.world_to_camera.w_axis = (-(r * (place + units * c.center()))).extend(1.0);
+            }
+            match colmap {
+                true => {
+                    capture.colmap("sparse/0", &frames.iter().map(|(n, c)| (&n[7..], *c)).collect::<Vec<_>>(), "\n")
+                }
+                false => capture.describe(&frames, json!({})),
+            }
+            let found = capture.read();
+            tells(&found.notes, NoteKind::Changed, &["far from the origin"]);
+            assert!((found.origin - place).length() <= 3.0 * units, "{}", found.origin);
+            let loaded = load(&found, &LoadConfig { hints: Hints::default(), ..LoadConfig::default() }).unwrap();
+            for (i, view) in loaded.views.iter().enumerate() {
+                let (center, truth) = (view.camera.center() + (found.origin - place), units * camera(i, 4).center());
+                assert!(center.distance(truth) < 1e-6 * units + 2e-9, "{center} {truth}");
+            }
+            // Views that are compared with go to the same origin.
+            let mut other = capture.read();
+            other.subtract(place);
+            assert_eq!(other.origin, place);
+        }
+    }
+    // Near to it nothing is moved; beyond all maps it is an error.
+    let capture = Capture::new();
+    for (name, c) in ring() {
+        shot(&c, |_, _| [0; 4]).save(capture.at(name)).unwrap();
+    }
+    capture.describe(&ring(), json!({}));
+    assert_eq!(capture.read().origin, DVec3::ZERO);
+    let mut frames = ring();
+    frames[0].1.world_to_camera.w_axis.x = 1e11;
+    capture.describe(&frames, json!({}));
+    says(cameras(capture.0.path(), None, None), &["frame 0", "from the origin"]);
+}
+
+/// A JPEG file with EXIF's orientation.
+fn jpeg(image: &RgbaImage, orientation: u8, to: &Path) {
+    let mut bytes = Vec::new();
+    let rgb = image::DynamicImage::ImageRgba8(image.clone()).into_rgb8();
+    image::codecs::jpeg::JpegEncoder::new_with_quality(&mut bytes, 97).encode_image(&rgb).unwrap();
+    let mut exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0".to_vec();
+    exif.extend([orientation, 0, 0, 0, 0, 0, 0, 0]);
+    let length = (exif.len() as u16 + 2).to_be_bytes();
+    std::fs::write(to, [&bytes[..2], &[0xff, 0xe1], &length, &exif, &bytes[2..]].concat()).unwrap();
+}
+
+/// RealityCapture's rows, as the documentation of its columns has them, with a principal point off the middle.
+fn realitycapture(frames: &[(&str, Camera)], px: [f64; 2]) -> String {
+    let mut csv = "#cameras 4\n#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n".to_owned();
+    for (name, c) in frames {
+        let axes = DMat3::from_mat4(c.world_to_camera).transpose();
+        let gl = DMat3::from_cols(axes.x_axis, -axes.y_axis, -axes.z_axis);
+        let pitch = gl.y_axis.z.asin().to_degrees();
+        let heading = -(-gl.y_axis.x).atan2(gl.y_axis.y).to_degrees();
+        let roll = (-gl.x_axis.z).atan2(gl.z_axis.z).to_degrees();
+        let (o, f) = (c.center(), 36.0 * c.fx / f64::from(c.width.max(c.height)));
+        let [px, py] = px;
+        csv += &format!("{name},{},{},{},{heading},{pitch},{roll},{f},{px},{py},0,0,0,0,0,0\n", o.x, o.y, o.z);
+    }
+    csv
+}
+
+#[test]
+fn realitycapture_keeps_stored_pixels_and_its_principal_point() {
+    // The pixels are the camera's own, whatever the file says of turning it; a point off the middle by 5 % of the longer side.
+    for orientation in [1, 3, 6] {
+        let capture = Capture::new();
+        let mut frames = ring();
+        for (name, c) in &mut frames {
+            (c.cx, c.cy) = (c.cx + 0.05 * f64::from(W), c.cy - 0.04 * f64::from(W));
+            jpeg(&shot(c, |_, _| WHITE), orientation, &capture.at(&name.replace("png", "jpg")));
+        }
+        let named: Vec<(&str, Camera)> =
+            ["a.jpg", "b.jpg", "c.jpg", "d.jpg"].into_iter().zip(frames).map(|(n, f)| (n, f.1)).collect();
+        std::fs::write(capture.at("cameras.csv"), realitycapture(&named, [0.05, -0.04])).unwrap();
+        let loaded = capture.load().unwrap();
+        assert_right(&loaded, 4);
+        assert!((loaded.views[0].camera.cx - (0.5 + 0.05) * f64::from(W)).abs() < 1e-9);
+    }
+}
+
+#[test]
+fn one_file_is_one_photo() {
+    // One name in two folders, and only one of the files.
+    let capture = Capture::new();
+    for (i, name) in ["images/0001.png", "images/0002.png", "images/0003.png"].iter().enumerate() {
+        shot(&camera(i, 4), |_, _| WHITE).save(capture.at(name)).unwrap();
+    }
+    let frames: Vec<(&str, Camera)> = ["cam0/0001.png", "cam1/0001.png", "cam0/0002.png", "cam0/0003.png"]
+        .into_iter()
+        .enumerate()
+        .map(|(i, n)| (n, camera(i, 4)))
+        .collect();
+    capture.colmap("sparse/0", &frames, "\n");
+    says(cameras(capture.0.path(), None, None), &["0001.png", "cam0/0001.png and cam1/0001.png", "different poses"]);
+    // RealityCapture's names without folders.
+    let capture = Capture::new();
+    for i in 0..3 {
+        shot(&camera(i, 4), |_, _| WHITE).save(capture.at(&format!("images/{i}.png"))).unwrap();
+    }
+    let frames: Vec<(&str, Camera)> =
+        ["0.png", "1.png", "2.png", "0.png"].into_iter().enumerate().map(|(i, n)| (n, camera(i, 4))).collect();
+    std::fs::write(capture.at("cameras.csv"), realitycapture(&frames, [0.0; 2])).unwrap();
+    says(cameras(capture.0.path(), None, None), &["0.png", "different poses"]);
+    // Twice under one pose: once.
+    let frames: Vec<(&str, Camera)> =
+        ["0.png", "1.png", "2.png", "0.png"].into_iter().enumerate().map(|(i, n)| (n, camera(i % 3, 4))).collect();
+    std::fs::write(capture.at("cameras.csv"), realitycapture(&frames, [0.0; 2])).unwrap();
+    let found = capture.read();
+    assert_eq!(found.photos.len(), 3);
+    tells(&found.notes, NoteKind::Dropped, &["1 photos", "twice"]);
+    // And a mask is one photo's.
+    let capture = Capture::new();
+    let frames: Vec<(&str, Camera)> = ["images/l/1.png", "images/r/1.png", "images/l/2.png"]
+        .into_iter()
+        .enumerate()
+        .map(|(i, n)| (n, camera(i, 4)))
+        .collect();
+    for (i, (name, c)) in frames.iter().enumerate() {
+        shot(c, busy(i)).save(capture.at(name)).unwrap();
+    }
+    capture.describe(&frames, json!({}));
+    outline(&camera(0, 4)).save(capture.at("masks/1.png")).unwrap();
+    outline(&camera(2, 4)).save(capture.at("masks/2.png")).unwrap();
+    says(capture.load(), &["masks/1.png", "the mask of one photo", "l/1.png and", "r/1.png"]);
+    std::fs::remove_file(capture.at("masks/1.png")).unwrap();
+    for (i, (name, _)) in frames.iter().enumerate() {
+        outline(&camera(i, 4)).save(capture.at(&name.replace("images", "masks"))).unwrap();
+    }
+    assert_right(&capture.load().unwrap(), 3);
+}
+
+#[test]
+fn photos_are_found_under_other_spellings_and_may_be_missing() {
+    let frames: Vec<(&str, Camera)> = ["IMG_1.jpg", "IMG_2.JPG", "img_3.png", "IMG_4.jpg", "gone.jpg"]
+        .into_iter()
+        .enumerate()
+        .map(|(i, n)| (n, camera(i, 5)))
+        .collect();
+    for format in [Format::Colmap, Format::Transforms, Format::Realitycapture] {
+        let capture = Capture::new();
+        for (i, file) in ["IMG_1.png", "IMG_2.jpg", "IMG_3.PNG", "img_4.webp"].iter().enumerate() {
+            let image = shot(&camera(i, 5), |_, _| WHITE);
+            match file.ends_with("jpg") {
+                true => jpeg(&image, 1, &capture.at(&format!("images/{file}"))),
+                false => image.save(capture.at(&format!("images/{file}"))).unwrap(),
+            }
+        }
+        match format {
+            Format::Colmap => capture.colmap("sparse/0", &frames, "\n"),
+            Format::Realitycapture => std::fs::write(capture.at("c.csv"), realitycapture(&frames, [0.0; 2])).unwrap(),
+            _ => {
+                let names: Vec<String> = frames.iter().map(|(n, _)| format!("images/{n}")).collect();
+                let frames: Vec<(&str, Camera)> =
+                    names.iter().map(String::as_str).zip(frames.iter().map(|f| f.1)).collect();
+                capture.describe(&frames, json!({}));
+            }
+        }
+        let found = capture.read();
+        tells(&found.notes, NoteKind::Warning, &["1 of 5 photos", "gone.jpg"]);
+        tells(&found.notes, NoteKind::Assumed, &["4 photos", "IMG_1.png for"]);
+        assert_right(&load(&found, &LoadConfig::default()).unwrap(), 4);
+        // Two files that it could be.
+        shot(&camera(0, 5), |_, _| WHITE).save(capture.at("images/IMG_1.webp")).unwrap();
+        says(cameras(capture.0.path(), None, None), &["IMG_1.jpg", "IMG_1.png", "IMG_1.webp"]);
+    }
+}
+
+#[test]
+fn photos_that_are_not_read_are_named_with_what_to_do() {
+    for (file, kind) in [("a.HEIC", "HEIC"), ("a.avif", "AVIF"), ("a.tif", "TIFF"), ("a.exr", "OpenEXR")] {
+        let capture = Capture::new();
+        for (name, c) in &ring()[1..] {
+            shot(c, |_, _| WHITE).save(capture.at(name)).unwrap();
+        }
+        std::fs::write(capture.at(&format!("images/{file}")), b"not looked at").unwrap();
+        capture.describe(&ring(), json!({}));
+        says(cameras(capture.0.path(), None, None), &[file, kind, "convert it to JPEG or PNG"]);
+        says(cameras(&capture.at("images"), None, None), &[file, kind, "convert it to JPEG or PNG"]);
+    }
+    // By content: messengers rename files.
+    for (bytes, kind) in [
+        (b"\0\0\0\x18ftypheic\0\0\0\0mif1heic".as_slice(), "HEIC"),
+        (b"\0\0\0\x18ftypavif\0\0\0\0avif", "AVIF"),
+        (b"II*\0\x08\0\0\0\0\0\0\0\0\0\0\0\0\0", "TIFF"),
+    ] {
+        let capture = Capture::new();
+        for (name, c) in ring() {
+            shot(&c, |_, _| WHITE).save(capture.at(name)).unwrap();
+        }
+        capture.describe(&ring(), json!({}));
+        std::fs::write(capture.at("images/c.png"), bytes).unwrap();
+        says(capture.load(), &["c.png", kind, "convert it to JPEG or PNG"]);
+    }
+}
+
+#[test]
+fn colors_of_wide_gamut_photos_are_converted() {
+    // The red of Display P3 that sRGB calls (200, 30, 20) is less in its own numbers.
+    let p3 = moxcms::ColorProfile::new_display_p3();
+    let layout = moxcms::Layout::Rgba;
+    let into = moxcms::ColorProfile::new_srgb().create_transform_8bit(
+        layout,
+        &p3,
+        layout,
+        moxcms::TransformOptions::default(),
+    );
+    let into = into.unwrap();
+    for (profile, converted) in [
+        (p3.encode().unwrap(), true),
+        (moxcms::ColorProfile::new_srgb().encode().unwrap(), false),
+        (b"no profile".to_vec(), false),
+    ] {
+        let capture = Capture::new();
+        for (name, c) in ring() {
+            let srgb = shot(&c, |_, _| WHITE);
+            let mut own = srgb.clone();
+            if converted {
+                into.transform(&srgb, &mut own).unwrap();
+            }
+            let mut encoder = image::codecs::png::PngEncoder::new(std::fs::File::create(capture.at(name)).unwrap());
+            encoder.set_icc_profile(profile.clone()).unwrap();
+            encoder.write_image(&own, W, H, image::ExtendedColorType::Rgba8).unwrap();
+        }
+        capture.describe(&ring(), json!({}));
+        let loaded = capture.load().unwrap();
+        assert_right(&loaded, 4);
+        let p = loaded.views[0].image.get_pixel(W / 2, H / 2);
+        assert!(p.0.iter().zip([200, 30, 20]).all(|(a, b)| a.abs_diff(b) <= 3), "{p:?}");
+        assert_eq!(loaded.notes.iter().any(|n| n.kind == NoteKind::Changed && n.contains("sRGB")), converted);
+    }
+}
+
+#[test]
+fn masks_are_looked_at_before_they_are_believed() {
+    let capture = |masks: &dyn Fn(usize, &Camera) -> (String, GrayImage)| {
+        let capture = Capture::new();
+        for (i, (name, c)) in ring().iter().enumerate() {
+            shot(c, busy(i)).save(capture.at(name)).unwrap();
+            let (name, mask) = masks(i, c);
+            mask.save(capture.at(&name)).unwrap();
+        }
+        capture.describe(&ring(), json!({}));
+        capture
+    };
+    let stem = |i: usize| ["a", "b", "c", "d"][i];
+    // RealityScan's names, and others.
+    for form in [
+        "masks/{}.png.mask.png",
+        "masks/{}.mask.png",
+        "mask/{}_mask.png",
+        "image_masks/{}.png.png",
+        "images/masks/{}.PNG",
+    ] {
+        let c = capture(&|i, c| (form.replace("{}", stem(i)), outline(c)));
+        let loaded = c.load().unwrap();
+        assert_eq!(loaded.masks, MaskKind::Files);
+        tells(&loaded.notes, NoteKind::Understood, &["masks are read from files", form.rsplit_once('/').unwrap().0]);
+        assert_right(&loaded, 4);
+    }
+    // Labels.
+    for label in [1, 7] {
+        let c = capture(&|i, c| {
+            let mut mask = outline(c);
+            mask.pixels_mut().for_each(|p| p[0] = p[0].min(label));
+            (format!("masks/{}.png", stem(i)), mask)
+        });
+        assert_right(&c.load().unwrap(), 4);
+    }
+    // The negative: refused by name, and right with the option that the message names.
+    let c = capture(&|i, c| {
+        let mut mask = outline(c);
+        image::imageops::invert(&mut mask);
+        (format!("masks/{}.png", stem(i)), mask)
+    });
+    says(c.load(), &["masks", "look inverted", "--invert-masks"]);
+    let given = LoadConfig { masks: MaskSource::Files(c.at("masks")), ..LoadConfig::default() };
+    says(load(&c.read(), &given), &["look inverted", "--invert-masks"]);
+    assert_right(&load(&c.read(), &LoadConfig { invert_masks: true, ..LoadConfig::default() }).unwrap(), 4);
+    // Names that fit no photo.
+    let c = capture(&|i, c| (format!("masks/other_{i}.png"), outline(c)));
+    let notes = match c.load() {
+        Ok(loaded) => loaded.notes,
+        // Busy backgrounds of no pose may be refused for themselves.
+        Err(e) => {
+            assert!(matches!(e, SceneError::NotCutOut { .. }), "{e}");
+            let mut notes = Vec::new();
+            for (i, (name, c0)) in ring().iter().enumerate() {
+                assert!(i < 4);
+                shot(c0, |_, _| WHITE).save(c.at(name)).unwrap();
+            }
+            notes.extend(c.load().unwrap().notes);
+            notes
+        }
+    };
+    tells(&notes, NoteKind::Warning, &["masks", "none of its 4 images has a photo's name"]);
+}
+
+#[test]
+fn masks_of_usable_pixels_are_not_the_object() {
+    // A stand at the photos' lower border is masked away; and masks that hide nothing.
+    for whole in [false, true] {
+        for named in [false, true] {
+            let capture = Capture::new();
+            for (name, c) in ring() {
+                let stand = |x: u32, y: u32| !whole && y > 60 && x.abs_diff(48) < 12;
+                shot(&c, |x, y| if stand(x, y) { [20, 160, 40, 255] } else { WHITE }).save(capture.at(name)).unwrap();
+                let mask = GrayImage::from_fn(W, H, |x, y| Luma([if stand(x, y) { 0 } else { 255 }]));
+                mask.save(capture.at(&name.replace("images", if named { "use" } else { "masks" }))).unwrap();
+            }
+            capture.describe(&ring(), json!({}));
+            if named {
+                let file = capture.at("transforms.json");
+                let mut root: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+                for frame in root["frames"].as_array_mut().unwrap() {
+                    frame["mask_path"] = json!(frame["file_path"].as_str().unwrap().replace("images", "use"));
+                }
+                std::fs::write(file, root.to_string()).unwrap();
+            }
+            let loaded = capture.load().unwrap();
+            assert_eq!(loaded.masks, MaskKind::Plain);
+            tells(&loaded.notes, NoteKind::Warning, &["which pixels may be used", "--masks FOLDER"]);
+            assert_right(&loaded, 4);
+        }
+    }
+}
+
+#[test]
+fn nothing_outside_of_the_scene_is_taken() {
+    // Folders beside and above the scene that have other captures' photos and masks of the same names.
+    let capture = Capture::new();
+    for (name, c) in ring() {
+        shot(&c, |_, _| WHITE).save(capture.at(&format!("all/scene/{name}"))).unwrap();
+        let strange = GrayImage::from_fn(W, H, |x, _| Luma([if x < 20 { 255 } else { 0 }]));
+        for folder in ["masks", "all/masks"] {
+            strange.save(capture.at(&name.replace("images", folder))).unwrap();
+        }
+        RgbImage::from_pixel(W, H, Rgb([1, 2, 3])).save(capture.at(&format!("all/{name}"))).unwrap();
+    }
+    let frames: Vec<(&str, Camera)> = ring().into_iter().map(|(n, c)| (n.trim_start_matches("images/"), c)).collect();
+    capture.colmap("all/scene/sparse/0", &frames, "\n");
+    for named in ["all/scene", "all/scene/sparse", "all/scene/sparse/0"] {
+        let loaded = load(&cameras(&capture.at(named), None, None).unwrap(), &LoadConfig::default()).unwrap();
+        assert_eq!(loaded.masks, MaskKind::Plain);
+        assert_right(&loaded, 4);
+    }
+    // A model that lies in the scene itself has no business in folders above.
+    std::fs::rename(capture.at("all/scene/sparse/0/cameras.txt"), capture.at("all/scene/model/cameras.txt")).unwrap();
+    std::fs::rename(capture.at("all/scene/sparse/0/images.txt"), capture.at("all/scene/model/images.txt")).unwrap();
+    says(cameras(&capture.at("all/scene/model"), None, None), &["none of its images", "a.png"]);
+}
+
+#[test]
+fn second_lines_of_images_may_be_missing() {
+    for between in ["", "\n", "# next\n", "\n# next\n\n", "1.5 2 -1 3 4 17\n", "1.5 2 -1\n# next\n", "1.5 2 -1\r\n"] {
+        let capture = Capture::new();
+        // One photo is called by a number.
+        let frames: Vec<(&str, Camera)> =
+            [("1", 0), ("b c.png", 1), ("c.png", 2), ("d.png", 3)].map(|(n, i)| (n, camera(i, 4))).to_vec();
+        for (name, c) in &frames {
+            let file = if *name == "1" { "1.png" } else { name };
+            shot(c, |_, _| WHITE).save(capture.at(&format!("images/{file}"))).unwrap();
+        }
+        capture.colmap("sparse/0", &frames, between);
+        let found = capture.read();
+        assert_eq!(found.photos.len(), 4, "{between:?}");
+        assert_right(&load(&found, &LoadConfig::default()).unwrap(), 4);
+    }
+}
+
+#[test]
+fn up_of_nerfstudios_colmap_scenes_is_not_z() {
+    let up = |fields: Value| {
+        let capture = Capture::new();
+        for (name, c) in ring() {
+            shot(&c, |_, _| WHITE).save(capture.at(name)).unwrap();
+        }
+        capture.describe(&ring(), fields);
+        capture.read().any_up
+    };
+    let applied = json!([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]]);
+    assert!(up(json!({"applied_transform": applied})));
+    assert!(up(json!({"applied_transform": applied, "orientation_override": "up"})));
+    assert!(!up(json!({"applied_transform": applied, "orientation_override": "none"})));
+    assert!(!up(json!({})));
+}
+
+/// A camera as Metashape's XML has it.
+fn transform(c: &Camera) -> String {
+    let m = c.world_to_camera.inverse().transpose().to_cols_array();
+    m.map(|v| format!("{v:e}")).join(" ")
+}
+
+fn metashape(capture: &Capture, sensors: &str, components: &str, list: &str) {
+    let xml = format!(
+        "<?xml version=\"1.0\" encoding=\"UTF-8\"?><document version=\"2.0.0\"><chunk label=\"C\" enabled=\"true\"><sensors>{sensors}</sensors>\
+         <components>{components}</components><cameras>{list}</cameras></chunk></document>"
+    );
+    std::fs::write(capture.at("cameras.xml"), xml).unwrap();
+}
+
+fn sensor(id: usize, more: &str, inner: &str) -> String {
+    let c = camera(0, 4);
+    format!(
+        "<sensor id=\"{id}\" type=\"frame\"{more}><resolution width=\"{W}\" height=\"{H}\"/>{inner}<calibration type=\"frame\" \
+         class=\"adjusted\"><resolution width=\"{W}\" height=\"{H}\"/><f>{}</f></calibration></sensor>",
+        c.fx
+    )
+}
+
+#[test]
+fn metashape_rigs_and_components_are_put_together() {
+    let capture = Capture::new();
+    let cs: Vec<Camera> = (0..4).map(|i| camera(i, 4)).collect();
+    for (name, c) in ring() {
+        shot(&c, |_, _| WHITE).save(capture.at(name)).unwrap();
+    }
+    let line = |values: &[f64]| values.iter().map(|v| format!("{v:e}")).collect::<Vec<_>>().join(" ");
+    // A rig of two: the second camera has no transform of its own.
+    let slave = |id: usize, master: usize, own: usize| {
+        let m = cs[master].world_to_camera * cs[own].world_to_camera.inverse();
+        let r = DMat3::from_mat4(m).transpose().to_cols_array();
+        let inner =
+            format!("<rotation>{}</rotation><location>{}</location>", line(&r), line(&m.w_axis.truncate().to_array()));
+        sensor(id, &format!(" master_id=\"{master}\""), &inner)
+    };
+    let posed = |i: usize, component: &str| {
+        let name = NAMES[i].trim_start_matches("images/");
+        format!(
+            "<camera id=\"{i}\" sensor_id=\"0\" {component} label=\"{name}\"><transform>{}</transform></camera>",
+            transform(&cs[i])
+        )
+    };
+    let of_rig = |i: usize, sensor: usize, master: usize| {
+        let name = NAMES[i].trim_start_matches("images/");
+        format!("<camera id=\"{i}\" sensor_id=\"{sensor}\" master_id=\"{master}\" label=\"{name}\"/>")
+    };
+    let sensors = sensor(0, "", "") + &slave(1, 0, 1) + &slave(2, 2, 3);
+    let list = posed(0, "component_id=\"0\"") + &of_rig(1, 1, 0) + &posed(2, "component_id=\"0\"") + &of_rig(3, 2, 2);
+    metashape(&capture, &sensors, "", &list);
+    assert_right(&capture.load().unwrap(), 4);
+    // A sensor that does not say where it is in its rig.
+    metashape(&capture, &(sensor(0, "", "") + &sensor(1, "", "")), "", &(posed(0, "") + &of_rig(1, 1, 0)));
+    says(cameras(capture.0.path(), None, None), &["sensor \"1\"", "place in its rig"]);
+
+    // Two components, each with its own frame and transform to a common one.
+    let turn = DMat3::from_rotation_z(0.7);
+    let shift = DVec3::new(3.0, -1.0, 0.5);
+    let in_other = |i: usize| {
+        let mut c = cs[i];
+        let center = turn.transpose() * (c.center() - shift) / 2.0;
+        let rotation = DMat3::from_mat4(c.world_to_camera) * turn;
+        c.world_to_camera = DMat4::from_mat3(rotation);
+        c.world_to_camera.w_axis = (-(rotation * center)).extend(1.0);
+        let name = NAMES[i].trim_start_matches("images/");
+        format!(
+            "<camera id=\"{i}\" sensor_id=\"0\" component_id=\"1\" label=\"{name}\"><transform>{}</transform></camera>",
+            transform(&c)
+        )
+    };
+    let list = posed(0, "component_id=\"0\"") + &posed(1, "component_id=\"0\"") + &in_other(2) + &in_other(3);
+    let moved = |id: usize, r: DMat3, t: DVec3, s: f64| {
+        format!(
+            "<component id=\"{id}\"><transform><rotation>{}</rotation><translation>{}</translation><scale>{s}</scale></transform></component>",
+            line(&r.transpose().to_cols_array()),
+            line(&t.to_array())
+        )
+    };
+    let both = moved(0, DMat3::IDENTITY, DVec3::ZERO, 1.0) + &moved(1, turn, shift, 2.0);
+    metashape(&capture, &sensor(0, "", ""), &both, &list);
+    let found = capture.read();
+    tells(&found.notes, NoteKind::Understood, &["2 of Metashape's components"]);
+    assert_right(&load(&found, &LoadConfig::default()).unwrap(), 4);
+    // Nothing that joins them: the larger one alone.
+    let list = list
+        + &posed(2, "component_id=\"0\"").replace("id=\"2\" sensor", "id=\"9\" sensor").replace("c.png", "gone.png");
+    metashape(&capture, &sensor(0, "", ""), "<component id=\"0\"/><component id=\"1\"/>", &list);
+    let found = capture.read();
+    tells(&found.notes, NoteKind::Warning, &["2 photos that are not in component \"0\"", "left out"]);
+    assert_eq!(found.photos.len(), 2);
+}
+
+#[test]
+fn polycams_files_without_sizes_are_read() {
+    // Sizes from the images; x, y, z are Polycam's z, x, y.
+    for folder in ["", "corrected_"] {
+        let capture = Capture::new();
+        for (i, c) in (0..4).map(|i| (i, camera(i, 4))) {
+            let axes = DMat3::from_mat4(c.world_to_camera).transpose();
+            let columns = [axes.x_axis, -axes.y_axis, -axes.z_axis, c.center()];
+            let mut root = json!({"fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy});
+            for (ours, theirs) in [(0, 2), (1, 0), (2, 1)] {
+                for (j, column) in columns.iter().enumerate() {
+                    root[format!("t_{theirs}{j}")] = json!(column[ours]);
+                }
+            }
+            std::fs::write(capture.at(&format!("keyframes/{folder}cameras/{i}.json")), root.to_string()).unwrap();
+            shot(&c, |_, _| WHITE).save(capture.at(&format!("keyframes/{folder}images/{i}.png"))).unwrap();
+        }
+        assert_right(&capture.load().unwrap(), 4);
+    }
+}
+
+#[test]
+fn colmap_models_are_written_with_their_origin() {
+    for origin in [DVec3::ZERO, DVec3::new(448_000.0, 5_411_000.0, 300.0)] {
+        let capture = Capture::new();
+        let views: Vec<View> = ring()
+            .into_iter()
+            .map(|(name, camera)| View {
+                name: format!("{} photo", &name[7..8]),
+                camera,
+                image: shot(&camera, |_, _| [0; 4]),
+            })
+            .collect();
+        let points = [(DVec3::new(0.1, 0.2, 0.3), [1, 2, 3]), (DVec3::ZERO, [255, 0, 9])];
+        freerange_scene::write_colmap(capture.0.path(), &views, origin, &points).unwrap();
+        let found = capture.read();
+        assert_eq!((found.format, found.photos.len()), (Format::Colmap, 4));
+        let loaded = load(&found, &LoadConfig::default()).unwrap();
+        for (view, read) in views.iter().zip(&loaded.views) {
+            assert_eq!((view.name.as_str(), view.camera.fx), (read.name.as_str(), read.camera.fx));
+            let off = read.camera.center() + found.origin - origin - view.camera.center();
+            assert!(off.length() < 1e-8, "{off}");
+        }
+        let bytes = std::fs::read(capture.at("sparse/0/points3D.bin")).unwrap();
+        assert_eq!(bytes.len(), 8 + 2 * (8 + 24 + 3 + 8 + 8));
+        assert_eq!(bytes[16..24], (origin.x + 0.1).to_le_bytes());
+        assert_eq!(bytes[40..43], [1, 2, 3]);
+    }
+}
+
+/// A model of wide lenses whose axes are turned away from the ball by so many degrees, and its photos.
+fn wide(model: &str, params: &str, lens: Lens, away: f64, behind: [u8; 4]) -> Capture {
+    let capture = Capture::new();
+    let (side, half) = (400.0, 200.0);
+    let focal = if lens == Lens::Equirectangular { side / std::f64::consts::TAU } else { 105.0 };
+    let down = if lens == Lens::Equirectangular { side / std::f64::consts::PI } else { focal };
+    let (mut c, mut i) = (String::new(), String::new());
+    for k in 0..4 {
+        let turn = DMat4::from_rotation_y(away.to_radians());
+        let pose = turn * camera(k, 4).world_to_camera;
+        let pinhole = Camera { world_to_camera: pose, ..camera(k, 4) };
+        let back = DMat3::from_mat4(pose).transpose();
+        let image = RgbaImage::from_fn(400, 400, |x, y| {
+            let (u, v) = ((f64::from(x) + 0.5 - half) / focal, (f64::from(y) + 0.5 - half) / down);
+            let ray = lens.ray(u, v).map(|r| back * r);
+            let hit = ray.is_some_and(|r| pinhole.center().cross(r).length() < BALL && r.dot(pinhole.center()) < 0.0);
+            Rgba(if hit { [200, 30, 20, 255] } else { behind })
+        });
+        image.save(capture.at(&format!("images/{k}.png"))).unwrap();
+        let (q, t) = (glam::DQuat::from_mat3(&DMat3::from_mat4(pose)), pose.w_axis.truncate());
+        c += &format!("{k} {model} 400 400 {params}\n");
+        i += &format!("{k} {} {} {} {} {} {} {} {k} {k}.png\n\n", q.w, q.x, q.y, q.z, t.x, t.y, t.z);
+    }
+    std::fs::write(capture.at("sparse/0/cameras.txt"), c).unwrap();
+    std::fs::write(capture.at("sparse/0/images.txt"), i).unwrap();
+    capture
+}
+
+#[test]
+fn wide_lenses_are_seen_by_a_pinhole_that_looks_at_the_object() {
+    let fisheye = Lens::Fisheye { k: [0.01, 0.0, 0.0, 0.0] };
+    let eucm = Lens::Eucm { alpha: 0.6, beta: 1.1 };
+    for (model, params, lens) in [
+        ("SIMPLE_RADIAL_FISHEYE", "105 200 200 0.01", fisheye),
+        ("EUCM", "105 105 200 200 0.6 1.1", eucm),
+        ("EQUIRECTANGULAR", "400 400", Lens::Equirectangular),
+    ] {
+        for away in [0.0, 40.0, 75.0, 160.0] {
+            if away > 90.0 && lens != Lens::Equirectangular {
+                continue;
+            }
+            let capture = wide(model, params, lens, away, [0; 4]);
+            let loaded = capture.load().unwrap();
+            assert_eq!(loaded.masks, MaskKind::Alpha);
+            for view in &loaded.views {
+                let seen = view.image.pixels().filter(|p| p[3] >= 128).count();
+                assert!(wrong(view) < 0.02 && seen > 250, "{model}, {away}: {:.3} {seen}", wrong(view));
+                // Nothing of it is cut off.
+                let (w, h) = view.image.dimensions();
+                let border =
+                    view.image.enumerate_pixels().filter(|(x, y, _)| *x == 0 || *y == 0 || *x == w - 1 || *y == h - 1);
+                assert!(border.into_iter().all(|(.., p)| p[3] < 128), "{model}, {away}");
+            }
+            // Masks go back to the photos' own pixels.
+            let out = tempfile::tempdir().unwrap();
+            let written = freerange_scene::write_masks(out.path(), &capture.read(), &loaded).unwrap();
+            let truth = image::open(capture.at("images/0.png")).unwrap().into_rgba8();
+            let mask = image::open(&written[0]).unwrap().into_luma8();
+            let (both, either) = mask.pixels().zip(truth.pixels()).fold((0, 0), |(both, either), (m, t)| {
+                let (m, t) = (m[0] >= 128, t[3] >= 128);
+                (both + u32::from(m && t), either + u32::from(m || t))
+            });
+            assert!(f64::from(both) > 0.85 * f64::from(either), "{model}, {away}: {both} of {either}");
+        }
+    }
+    // Before a plain background, from where all of it is known.
+    let capture = wide("SIMPLE_RADIAL_FISHEYE", "105 200 200 0.01", fisheye, 60.0, WHITE);
+    let hints = Hints { center: Some(DVec3::ZERO), radius: Some(BALL), others: None };
+    let loaded = load(&capture.read(), &LoadConfig { hints, ..LoadConfig::default() }).unwrap();
+    tells(&loaded.notes, NoteKind::Changed, &["4 photos of wide lenses", "looks at the object"]);
+    assert!(loaded.views.iter().all(|v| wrong(v) < 0.02));
+    // All around, and nothing says where the object is.
+    let capture = wide("EQUIRECTANGULAR", "400 400", Lens::Equirectangular, 0.0, WHITE);
+    says(capture.load(), &["camera model", "--center X,Y,Z", "all around"]);
+}

@@ -1,0 +1,462 @@
+//! What a fit can be told, with its defaults.
+
+use crate::FitError;
+pub use freerange_util::{Background, Invalid};
+use serde::{Deserialize, Serialize};
+
+/// Learning rate of each kind of channel, per step of Adam.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Rates {
+    /// Centers, in world units.
+    pub mean: f64,
+    /// Logarithms of the standard deviations.
+    pub scale: f64,
+    /// Components of the unit quaternion.
+    pub rotation: f64,
+    /// Logit of the opacity.
+    pub opacity: f64,
+    /// Color, sRGB-encoded 0..1.
+    pub color: f64,
+}
+
+/// Settings of [`fit`](crate::fit). The defaults suit objects in the canonical frame (a sphere of radius 0.5 about
+/// the origin). They are 3DGS-MCMC's published values where those do not depend on the size of the world.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct FitConfig {
+    /// Optimization steps.
+    pub iterations: usize,
+    /// Number of Gaussians never exceeded, and reached if there are enough growth steps.
+    pub cap_max: usize,
+    /// Number of Gaussians to start with, where no cloud is given; at most `cap_max`.
+    pub initial: usize,
+    /// Their opacity at the start, 0..1. Fits that start from points on a surface take it, too.
+    pub initial_opacity: f64,
+    /// Their standard deviation at the start, in multiples of the distance to the three nearest neighbors.
+    pub initial_scale: f64,
+    /// Radius of the sphere around the origin that holds the object. World units.
+    pub radius: f64,
+    /// Steps between two rounds of relocation and growth.
+    pub refine_every: usize,
+    /// First step with such a round.
+    pub growth_start: usize,
+    /// Fraction of the iterations after which there are no more such rounds, 0..1.
+    pub growth_stop: f64,
+    /// Factor by which the number of Gaussians grows in one round, at least 1.
+    pub growth: f64,
+    /// Learning rates at the start.
+    pub rates: Rates,
+    /// Learning rate of the centers at the end, reached exponentially. The others are constant.
+    pub final_mean_rate: f64,
+    /// Weight of 1 - SSIM; that of L1 is the rest. 0..1
+    pub lambda_ssim: f64,
+    /// Weight of the mean opacity in the loss.
+    pub opacity_regularizer: f64,
+    /// Weight of the mean standard deviation in the loss.
+    pub scale_regularizer: f64,
+    /// Strength of the noise that moves faint Gaussians, in multiples of the centers' current learning rate.
+    pub noise_lr: f64,
+    /// Gaussians of at most this opacity are dead and are relocated. 0..1
+    pub dead_opacity: f64,
+    /// Background of the renders. Views without transparency are compared as they are, with their background.
+    pub background: Background,
+    /// Views compared at each step.
+    pub views_per_step: usize,
+    /// Longest side, in pixels, at which views are compared; larger ones are shrunk. None: as they are.
+    pub render_size: Option<u32>,
+    /// Seed of everything drawn.
+    pub seed: u64,
+}
+
+impl Default for FitConfig {
+    fn default() -> Self {
+        Self {
+            iterations: 3000,
+            cap_max: 4096,
+            initial: 2048,
+            initial_opacity: 0.5,
+            initial_scale: 0.5,
+            radius: 0.5,
+            refine_every: 100,
+            growth_start: 500,
+            growth_stop: 5.0 / 6.0,
+            growth: 1.05,
+            // The published rates are 1.6e-4 times the extent of the cameras for the centres, also down to a hundredth,
+            // and 5e-3 for the sizes, for 30,000 steps. Fits of small objects in 100 to 3000 steps gain most from more:
+            // 1 to 2 dB on scanned ones, and their slices as much.
+            rates: Rates { mean: 3e-3, scale: 1e-2, rotation: 1e-3, opacity: 0.05, color: 2.5e-3 },
+            final_mean_rate: 3e-5,
+            lambda_ssim: 0.2,
+            opacity_regularizer: 0.01,
+            scale_regularizer: 0.01,
+            noise_lr: 5e5,
+            dead_opacity: 0.005,
+            background: Background::Random,
+            views_per_step: 1,
+            render_size: None,
+            seed: 0,
+        }
+    }
+}
+
+/// Settings of [`refine`](crate::refine). The defaults suit objects in the canonical frame (a sphere of radius 0.5 about
+/// the origin).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct RefineConfig {
+    /// Optimisation steps; each one looks at one view, and at one picture of the hold.
+    pub steps: usize,
+    /// Number of Gaussians at the end; a cloud that has more keeps its number.
+    pub gaussians: usize,
+    /// Rounds of relocation and growth, spread evenly over the steps up to the last sixth.
+    pub growth_rounds: usize,
+    /// Learning rates at the start.
+    pub rates: Rates,
+    /// Learning rate of the centers at the end, reached exponentially. The others are constant.
+    pub final_mean_rate: f64,
+    /// Weight of 1 - SSIM; that of L1 is the rest. 0..1
+    pub lambda_ssim: f64,
+    /// What the Gaussians are rendered in front of.
+    pub background: Background,
+    /// Longest side, in pixels, at which views are compared; larger ones are shrunk. None: as they are.
+    pub render_size: Option<u32>,
+    /// Part of the steps, the first ones, that compare views at [`coarse_size`](Self::coarse_size): what they see is coarse as yet. 0..1
+    pub coarse: f64,
+    /// Longest side in pixels at which these steps compare views. Smaller views are compared as they are.
+    pub coarse_size: u32,
+    /// What keeps the cloud where no view looks.
+    pub hold: HoldConfig,
+    /// Seed of everything drawn.
+    pub seed: u64,
+}
+
+impl Default for RefineConfig {
+    fn default() -> Self {
+        Self {
+            steps: 500,
+            gaussians: 8192,
+            growth_rounds: 16,
+            rates: Rates { mean: 1.5e-3, scale: 5e-3, ..FitConfig::default().rates },
+            final_mean_rate: 1.5e-5,
+            lambda_ssim: 0.2,
+            background: Background::Random,
+            render_size: Some(256),
+            coarse: 0.0,
+            coarse_size: 256,
+            hold: HoldConfig::default(),
+            seed: 0,
+        }
+    }
+}
+
+/// Pictures of the cloud before a refinement, taken from all around it: further views that the refined one has to agree
+/// with.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct HoldConfig {
+    /// Weight of the mean absolute difference from a picture, beside a loss of weight 1 on a view. 0: no hold.
+    pub weight: f64,
+    /// Number of pictures.
+    pub views: usize,
+    /// Their width and height in pixels.
+    pub size: u32,
+    /// Radius of the sphere around the origin that they show. World units.
+    pub radius: f64,
+}
+
+impl Default for HoldConfig {
+    fn default() -> Self {
+        Self { weight: 0.1, views: 12, size: 128, radius: 0.5 }
+    }
+}
+
+/// Refuses with the field's name unless `ok`, which is written so that NaN fails it.
+pub(crate) fn check(
+    field: &'static str,
+    expected: &str,
+    found: impl std::fmt::Display,
+    ok: bool,
+) -> Result<(), FitError> {
+    if ok { Ok(()) } else { Err(Invalid::new(field, expected, found).into()) }
+}
+
+fn finite_not_negative(field: &'static str, v: f64) -> Result<(), FitError> {
+    check(field, "a finite number, at least 0", v, v >= 0.0 && v.is_finite())
+}
+
+fn positive(field: &'static str, v: f64) -> Result<(), FitError> {
+    check(field, "a finite number above 0", v, v > 0.0 && v.is_finite())
+}
+
+fn fraction(field: &'static str, v: f64) -> Result<(), FitError> {
+    check(field, "a number from 0 to 1", v, (0.0..=1.0).contains(&v))
+}
+
+fn at_least_one(field: &'static str, v: usize) -> Result<(), FitError> {
+    check(field, "at least 1", v, v >= 1)
+}
+
+impl Rates {
+    fn check(&self) -> Result<(), FitError> {
+        finite_not_negative("rates.mean", self.mean)?;
+        finite_not_negative("rates.scale", self.scale)?;
+        finite_not_negative("rates.rotation", self.rotation)?;
+        finite_not_negative("rates.opacity", self.opacity)?;
+        finite_not_negative("rates.color", self.color)
+    }
+}
+
+fn check_render_size(size: Option<u32>) -> Result<(), FitError> {
+    check("render_size", "at least 1 pixel", size.unwrap_or(1), size != Some(0))
+}
+
+/// Enough for any use, and few enough that their memory (about 200 bytes each) does not decide.
+const MAX_GAUSSIANS: usize = 1 << 24;
+
+impl FitConfig {
+    /// Refuses values that no fit can work with.
+    pub fn check(&self) -> Result<(), FitError> {
+        at_least_one("iterations", self.iterations)?;
+        let most = self.cap_max;
+        check("cap_max", "1 to 16777216", most, (1..=MAX_GAUSSIANS).contains(&most))?;
+        check("initial", "1 to cap_max", self.initial, (1..=most).contains(&self.initial))?;
+        let strict = |v: f64| v > 0.0 && v < 1.0;
+        check("initial_opacity", "between 0 and 1", self.initial_opacity, strict(self.initial_opacity))?;
+        check("dead_opacity", "between 0 and 1", self.dead_opacity, strict(self.dead_opacity))?;
+        positive("initial_scale", self.initial_scale)?;
+        positive("radius", self.radius)?;
+        at_least_one("refine_every", self.refine_every)?;
+        fraction("growth_stop", self.growth_stop)?;
+        check("growth", "a finite number, at least 1", self.growth, self.growth >= 1.0 && self.growth.is_finite())?;
+        self.rates.check()?;
+        positive("rates.mean", self.rates.mean)?;
+        positive("final_mean_rate", self.final_mean_rate)?;
+        fraction("lambda_ssim", self.lambda_ssim)?;
+        finite_not_negative("opacity_regularizer", self.opacity_regularizer)?;
+        finite_not_negative("scale_regularizer", self.scale_regularizer)?;
+        finite_not_negative("noise_lr", self.noise_lr)?;
+        at_least_one("views_per_step", self.views_per_step)?;
+        check_render_size(self.render_size)
+    }
+}
+
+/// Part of the steps of a refinement after which there are no more rounds of growth: the last Gaussians have to settle.
+const GROWTH_STOP: f64 = 5.0 / 6.0;
+
+/// Photos that the defaults of a refinement are for, and those from which on more change nothing.
+const PHOTOS: usize = 4;
+const MOST_PHOTOS: usize = 16;
+
+/// Up to so many pixels, the longest side, pictures grow with the number of photos.
+const MOST_GROWN: u32 = 512;
+
+/// What [`RefineConfig::coarse`] is where detail is asked for: a third less time, and the same in the end.
+const COARSE: f64 = 0.6;
+
+impl RefineConfig {
+    /// These settings, which are for up to four photos, for so many: as many steps for each, more of their pixels, up to 512, and less of a
+    /// hold, since more of the object is seen. From sixteen photos on nothing changes any more.
+    #[must_use]
+    pub fn for_photos(self, photos: usize) -> Self {
+        let photos = photos.clamp(PHOTOS, MOST_PHOTOS);
+        let more = photos as f64 / PHOTOS as f64;
+        let grown = |size: u32| ((f64::from(size) * more.sqrt()).round() as u32).min(size.max(MOST_GROWN));
+        Self {
+            steps: self.steps * photos / PHOTOS,
+            render_size: self.render_size.map(grown),
+            hold: HoldConfig { weight: self.hold.weight / more.powf(1.5), ..self.hold },
+            ..self
+        }
+    }
+
+    /// These settings for finer detail: so many times the size of pictures and the Gaussians, and so much less of a hold, whose own pictures
+    /// are small; at first at half that size. From 3 on half as many times the steps as well: 2 needs no more of them. 1 changes nothing.
+    /// Photos, whose longest side has `longest` pixels, have no finer detail than their pixels: it is as much as they can show at most.
+    #[must_use]
+    pub fn detailed(self, detail: usize, longest: u32) -> Self {
+        let shown = self.render_size.map_or(usize::MAX, |size| longest.div_ceil(size.max(1)) as usize);
+        let detail = detail.min(shown);
+        if detail < 2 {
+            return self;
+        }
+        let grown = |size: u32| size.saturating_mul(detail as u32);
+        Self {
+            steps: self.steps.saturating_mul(detail) / 2,
+            gaussians: self.gaussians.saturating_mul(detail),
+            render_size: self.render_size.map(grown),
+            coarse: COARSE,
+            coarse_size: (grown(self.coarse_size) / 2).max(1),
+            hold: HoldConfig { weight: self.hold.weight / detail as f64, ..self.hold },
+            ..self
+        }
+    }
+
+    /// Refuses values that no refinement can work with.
+    pub fn check(&self) -> Result<(), FitError> {
+        let steps = self.steps;
+        at_least_one("steps", steps)?;
+        check("gaussians", "1 to 16777216", self.gaussians, (1..=MAX_GAUSSIANS).contains(&self.gaussians))?;
+        self.rates.check()?;
+        positive("rates.mean", self.rates.mean)?;
+        positive("final_mean_rate", self.final_mean_rate)?;
+        fraction("lambda_ssim", self.lambda_ssim)?;
+        check_render_size(self.render_size)?;
+        fraction("coarse", self.coarse)?;
+        check("coarse_size", "at least 1 pixel", self.coarse_size, self.coarse_size > 0)?;
+        self.hold.check()
+    }
+
+    /// The fit that goes on from a cloud of `start` Gaussians.
+    pub(crate) fn fit(&self, start: usize) -> FitConfig {
+        let most = self.gaussians.max(start);
+        // A round comes at every multiple of the interval but step 0.
+        let last = GROWTH_STOP * self.steps as f64;
+        let interval = ((last / (self.growth_rounds + 1) as f64) as usize).max(1);
+        let rounds = ((last / interval as f64).ceil() as i32 - 1).max(1);
+        FitConfig {
+            iterations: self.steps,
+            cap_max: most,
+            initial: start,
+            refine_every: interval,
+            growth_start: if self.growth_rounds == 0 { usize::MAX } else { interval },
+            growth_stop: GROWTH_STOP,
+            // One Gaussian more, since rounds round down.
+            growth: (most as f64 / start as f64).powf(1.0 / f64::from(rounds)) + 1.0 / start as f64,
+            rates: self.rates,
+            final_mean_rate: self.final_mean_rate,
+            lambda_ssim: self.lambda_ssim,
+            background: self.background,
+            render_size: self.render_size,
+            seed: self.seed,
+            ..FitConfig::default()
+        }
+    }
+}
+
+impl HoldConfig {
+    fn check(&self) -> Result<(), FitError> {
+        finite_not_negative("hold.weight", self.weight)?;
+        check("hold.views", "1 to 1000", self.views, (1..=1000).contains(&self.views))?;
+        check("hold.size", "16 to 1024", self.size, (16..=1024).contains(&self.size))?;
+        positive("hold.radius", self.radius)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn more_photos_are_refined_longer_and_larger_and_held_less() {
+        let config = RefineConfig::default();
+        for photos in [0, 2, 4] {
+            assert_eq!(config.clone().for_photos(photos), config);
+        }
+        let eight = config.clone().for_photos(8);
+        assert_eq!((eight.steps, eight.render_size), (1000, Some(362)));
+        assert!((eight.hold.weight - 0.1 / 8f64.sqrt()).abs() < 1e-12);
+        let sixteen = config.clone().for_photos(16);
+        assert_eq!((sixteen.steps, sixteen.render_size, sixteen.hold.weight), (2000, Some(512), 0.1 / 8.0));
+        assert_eq!(config.clone().for_photos(usize::MAX), sixteen);
+        sixteen.check().unwrap();
+        // What is as large already stays.
+        let detailed = config.clone().detailed(2, 4000).for_photos(8);
+        assert_eq!((detailed.steps, detailed.render_size, detailed.gaussians), (1000, Some(512), 16_384));
+        assert_eq!(config.clone().detailed(4, 4000).for_photos(16).render_size, Some(1024));
+        let whole = RefineConfig { render_size: None, ..config };
+        assert_eq!(whole.for_photos(8).render_size, None);
+    }
+
+    #[test]
+    fn detail_is_size_and_gaussians_and_later_steps() {
+        let config = RefineConfig::default();
+        for detail in [0, 1] {
+            assert_eq!(config.clone().detailed(detail, 4000), config);
+        }
+        let two = config.clone().detailed(2, 512);
+        assert_eq!((two.steps, two.gaussians, two.render_size, two.hold.weight), (500, 16_384, Some(512), 0.05));
+        assert_eq!((two.coarse, two.coarse_size), (0.6, 256));
+        let four = config.clone().detailed(4, 4000);
+        assert_eq!((four.steps, four.gaussians, four.render_size, four.coarse_size), (1000, 32_768, Some(1024), 512));
+        assert_eq!(four.hold.weight, 0.025);
+        four.check().unwrap();
+        // No more than photos show.
+        assert_eq!(config.clone().detailed(4, 512), two);
+        assert_eq!(config.clone().detailed(4, 257), two);
+        assert_eq!(config.clone().detailed(4, 256), config);
+        let whole = RefineConfig { render_size: None, ..config };
+        assert_eq!(whole.detailed(4, 100).render_size, None);
+    }
+
+    #[test]
+    fn defaults_pass_and_survive_serde() {
+        FitConfig::default().check().unwrap();
+        RefineConfig::default().check().unwrap();
+        let text = serde_json::to_string(&FitConfig::default()).unwrap();
+        assert_eq!(serde_json::from_str::<FitConfig>(&text).unwrap(), FitConfig::default());
+        assert_eq!(serde_json::from_str::<RefineConfig>("{}").unwrap(), RefineConfig::default());
+    }
+
+    #[test]
+    fn unknown_fields_are_refused() {
+        assert!(serde_json::from_str::<FitConfig>("{\"iteration\": 3}").is_err());
+        assert!(serde_json::from_str::<RefineConfig>("{\"step\": 3}").is_err());
+    }
+
+    #[test]
+    fn impossible_values_are_named() {
+        let refused = |change: &dyn Fn(&mut FitConfig), field: &str| {
+            let mut config = FitConfig::default();
+            change(&mut config);
+            let message = config.check().unwrap_err().to_string();
+            assert!(message.starts_with(field), "{message}");
+        };
+        refused(&|c| c.iterations = 0, "iterations");
+        refused(&|c| c.cap_max = usize::MAX, "cap_max");
+        refused(&|c| c.initial = c.cap_max + 1, "initial");
+        refused(&|c| c.noise_lr = f64::NAN, "noise_lr");
+        refused(&|c| c.growth = 0.9, "growth");
+        refused(&|c| c.lambda_ssim = 1.1, "lambda_ssim");
+        refused(&|c| c.rates.color = f64::INFINITY, "rates.color");
+        refused(&|c| c.render_size = Some(0), "render_size");
+        let refused = |change: &dyn Fn(&mut RefineConfig), field: &str| {
+            let mut config = RefineConfig::default();
+            change(&mut config);
+            let message = config.check().unwrap_err().to_string();
+            assert!(message.starts_with(field), "{message}");
+        };
+        refused(&|c| c.steps = 0, "steps");
+        refused(&|c| c.gaussians = 0, "gaussians");
+        refused(&|c| c.rates.mean = 0.0, "rates.mean");
+        refused(&|c| c.final_mean_rate = f64::NAN, "final_mean_rate");
+        refused(&|c| c.coarse = 1.5, "coarse");
+        refused(&|c| c.coarse_size = 0, "coarse_size");
+        refused(&|c| c.hold.weight = -1.0, "hold.weight");
+        refused(&|c| c.hold.views = 0, "hold.views");
+        refused(&|c| c.hold.size = 8, "hold.size");
+        refused(&|c| c.hold.radius = f64::INFINITY, "hold.radius");
+    }
+
+    /// However few the steps and large the start, the fit is possible and its growth reaches the number asked for.
+    #[test]
+    fn a_refinement_grows_to_its_number() {
+        for (steps, start, growth_rounds) in
+            [(500, 1024, 16), (1, 1024, 16), (20, 1, 16), (1000, 5000, 16), (300, 9, 0), (7, 3, 1)]
+        {
+            let config = RefineConfig { steps, growth_rounds, ..Default::default() };
+            let fit = config.fit(start);
+            fit.check().unwrap();
+            let due = |step: &usize| {
+                *step >= fit.growth_start
+                    && step.is_multiple_of(fit.refine_every)
+                    && (*step as f64) < fit.growth_stop * steps as f64
+            };
+            let rounds = (0..steps).filter(due).count();
+            assert_eq!(rounds > 0, growth_rounds > 0 && steps > 2, "{rounds} of {growth_rounds}");
+            assert!(rounds <= 2 * growth_rounds, "{rounds} of {growth_rounds}");
+            let grown = (0..rounds).fold(start, |count, _| crate::mcmc::grown(count, &fit));
+            assert!(rounds == 0 || grown == start.max(8192), "{grown} after {rounds}");
+        }
+    }
+}

@@ -1,0 +1,47 @@
+//! The crate's error.
+
+use freerange_util::Invalid;
+
+/// Why a fit cannot start or go on.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum FitError {
+    /// There is nothing to fit to.
+    #[error("no views: a fit needs at least one")]
+    NoViews,
+    /// There is nothing to refine.
+    #[error("the cloud to start from holds no Gaussians")]
+    EmptyCloud,
+    /// A view cannot be used.
+    #[error("view {name:?}: {field}: expected {expected}, found {found}")]
+    View {
+        /// The view's name.
+        name: String,
+        /// What of it.
+        field: &'static str,
+        /// What it must be.
+        expected: String,
+        /// What it is.
+        found: String,
+    },
+    /// A configuration value is impossible.
+    #[error(transparent)]
+    Config(#[from] Invalid),
+    /// The optimisation left the finite numbers.
+    #[error("step {step}: {what} is not finite; smaller learning rates may help")]
+    Diverged {
+        /// The step, counted from 0.
+        step: usize,
+        /// What is not finite.
+        what: &'static str,
+    },
+    /// The cloud to start from.
+    #[error(transparent)]
+    Splat(#[from] freerange_gaussians::SplatError),
+    /// The rasteriser.
+    #[error(transparent)]
+    Raster(#[from] freerange_raster::RasterError),
+    /// The loss.
+    #[error(transparent)]
+    Metrics(#[from] freerange_raster::metrics::ImageError),
+}

@@ -1,0 +1,126 @@
+//! The fit from nothing: 3DGS-MCMC.
+
+use crate::{
+    Evidence, FitConfig, FitError, FitProgress,
+    adam::Adam,
+    init::random_cloud,
+    mcmc::{add_noise, relocate_and_grow},
+    objective::{Objective, check_cloud, normalize_rotations},
+    views::Targets,
+};
+use freerange_gaussians::Cloud;
+use freerange_util::Invalid;
+use rand::{SeedableRng, seq::SliceRandom};
+use rand_chacha::ChaCha8Rng;
+use std::ops::ControlFlow;
+
+/// Fits Gaussians to posed views, and outlines where there are any, by 3DGS-MCMC (Kheradmand et al. 2024): Adam on the photometric loss, with noise that
+/// lets faint Gaussians explore and relocation of dead ones, which also grows their number.
+///
+/// Starts from `initial`, or, without it, from random Gaussians where all views see the object. `progress` hears of
+/// every step, and ends the fit with what it has by `ControlFlow::Break`. The same input gives the same bytes.
+///
+/// # Errors
+/// If there are no views, or they differ in size from their camera; if the configuration is impossible,
+/// `initial` is empty, not finite or larger than `cap_max`; or if the optimisation diverges.
+pub fn fit<'a>(
+    seen: impl Into<Evidence<'a>>,
+    initial: Option<&Cloud>,
+    config: &FitConfig,
+    progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
+) -> Result<Cloud, FitError> {
+    config.check()?;
+    let targets = Targets::new(seen, config.render_size)?;
+    let mut rng = ChaCha8Rng::seed_from_u64(config.seed);
+    let cloud = match initial {
+        Some(cloud) => checked(cloud, config.cap_max)?,
+        None => random_cloud(&targets, config, &mut rng),
+    };
+    optimise(cloud, |_| &targets, config, &mut rng, |_, _| Ok(Vec::new()), progress)
+}
+
+/// The optimisation itself. `of_step` is what each step compares with, at whatever size; `more` are further terms of the objective of a cloud over a background.
+pub(crate) fn optimise<'t>(
+    mut cloud: Cloud,
+    of_step: impl Fn(usize) -> &'t Targets,
+    config: &FitConfig,
+    rng: &mut ChaCha8Rng,
+    mut more: impl FnMut(&Cloud, [f32; 3]) -> Result<Vec<Objective>, FitError> + Send,
+    mut progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
+) -> Result<Cloud, FitError> {
+    let mut adam = Adam::default();
+    let (mut queue, mut outline_queue) = (Vec::new(), Vec::new());
+    for step in 0..config.iterations {
+        let targets = of_step(step);
+        let outlines = targets.cameras.len() - targets.views;
+        let done = step as f64 / config.iterations as f64;
+        let mean_rate = config.rates.mean * (config.final_mean_rate / config.rates.mean).powf(done);
+
+        // Within the pool: from outside, each of the many small pieces of a step would wait for a thread to wake.
+        let loss = rayon::scope(|_| {
+            // Every other step looks at outlines alone, if there are any.
+            let outlined = outlines > 0 && step % 2 == 1;
+            let chosen = match outlined {
+                true => next_views(&mut outline_queue, outlines, config.views_per_step, rng),
+                false => next_views(&mut queue, targets.views, config.views_per_step, rng),
+            };
+            let background = config.background.draw(rng);
+            let own = || match outlined {
+                true => Objective::outlines(&cloud, targets, &chosen),
+                false => Objective::photometric(&cloud, targets, &chosen, background, config.lambda_ssim),
+            };
+            let (own, further) = rayon::join(own, || more(&cloud, background));
+            let mut objective = own?;
+            let loss = objective.loss;
+            further?.iter().for_each(|other| objective.add(other));
+            objective.add_opacity(&cloud, config.opacity_regularizer);
+            objective.add_scale(&cloud, config.scale_regularizer);
+            objective.check(step)?;
+            adam.step(cloud.rows_mut(), &objective.gradients, &config.rates.by_channel(mean_rate));
+            normalize_rotations(&mut cloud);
+
+            let due = step >= config.growth_start && step % config.refine_every == 0;
+            if due && done < config.growth_stop {
+                relocate_and_grow(&mut cloud, &mut adam, config, rng);
+            }
+            add_noise(&mut cloud, config.noise_lr * mean_rate, config.dead_opacity, rng);
+            check_cloud(&cloud, step)?;
+            Ok::<_, FitError>(loss)
+        })?;
+
+        let (step, steps, gaussians) = (step + 1, config.iterations, cloud.len());
+        if progress(&FitProgress { step, steps, loss, gaussians, cloud: &cloud }).is_break() {
+            break;
+        }
+    }
+    cloud.canonicalize_rotations();
+    Ok(cloud)
+}
+
+/// A cloud to start from.
+pub(crate) fn checked(cloud: &Cloud, most: usize) -> Result<Cloud, FitError> {
+    if cloud.is_empty() {
+        return Err(FitError::EmptyCloud);
+    }
+    cloud.check_finite()?;
+    if cloud.len() > most {
+        let expected = format!("at least the {} Gaussians to start from", cloud.len());
+        return Err(Invalid::new("cap_max", expected, most).into());
+    }
+    let mut cloud = cloud.clone();
+    cloud.canonicalize_rotations();
+    Ok(cloud)
+}
+
+/// The next views to look at: all of them once in random order, then again.
+pub(crate) fn next_views(queue: &mut Vec<usize>, count: usize, per_step: usize, rng: &mut ChaCha8Rng) -> Vec<usize> {
+    let mut chosen = Vec::new();
+    while chosen.len() < per_step.min(count) {
+        if queue.is_empty() {
+            *queue = (0..count).collect();
+            queue.shuffle(rng);
+        }
+        chosen.extend(queue.pop());
+    }
+    chosen
+}

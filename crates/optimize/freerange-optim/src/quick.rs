@@ -1,0 +1,90 @@
+//! A fit of seconds: what a few views tell without a network, for sampling and training to start from.
+
+use std::ops::ControlFlow;
+
+use freerange_gaussians::{Alignment, Cloud, LodTree};
+use serde::{Deserialize, Serialize};
+
+use crate::{Evidence, FitConfig, FitError, FitProgress, config::check, fit};
+
+/// Settings of [`quick_fit`].
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct QuickFitConfig {
+    /// Optimization steps, one view each.
+    pub iterations: usize,
+    /// Number of Gaussians.
+    pub gaussians: usize,
+    /// Longest side, in pixels, at which views are compared; larger ones are shrunk.
+    pub render_size: u32,
+}
+
+impl Default for QuickFitConfig {
+    fn default() -> Self {
+        Self { iterations: 200, gaussians: 1024, render_size: 128 }
+    }
+}
+
+impl QuickFitConfig {
+    /// Refuses values that no fit can work with.
+    pub fn check(&self) -> Result<(), FitError> {
+        check("iterations", "1 to 100000", self.iterations, (1..=100_000).contains(&self.iterations))?;
+        check("gaussians", "1 to 65536", self.gaussians, (1..=65_536).contains(&self.gaussians))?;
+        check("render_size", "8 to 4096 pixels", self.render_size, (8..=4096).contains(&self.render_size))
+    }
+
+    fn config(&self, seed: u64) -> FitConfig {
+        FitConfig {
+            iterations: self.iterations,
+            cap_max: self.gaussians,
+            initial: self.gaussians,
+            // Relocation alone: the number does not grow.
+            growth_start: 50,
+            refine_every: 50,
+            growth: 1.0,
+            render_size: Some(self.render_size),
+            seed,
+            ..FitConfig::default()
+        }
+    }
+}
+
+/// A short 3DGS-MCMC fit of what is `seen`, which lies in the canonical frame, from the visual hull of the masks.
+///
+/// # Errors
+/// Those of [`fit`].
+pub fn quick_fit<'a>(
+    seen: impl Into<Evidence<'a>>,
+    config: &QuickFitConfig,
+    seed: u64,
+    progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
+) -> Result<Cloud, FitError> {
+    config.check()?;
+    fit(seen, None, &config.config(seed), progress)
+}
+
+/// `cloud`, moved by as short a fit of what is `seen`: what a sample needs that the views do not look like. It keeps its
+/// number of Gaussians, whatever `config` says of that.
+///
+/// # Errors
+/// Those of [`fit`].
+pub(crate) fn polish<'a>(
+    cloud: &Cloud,
+    seen: impl Into<Evidence<'a>>,
+    config: &QuickFitConfig,
+    seed: u64,
+    progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
+) -> Result<Cloud, FitError> {
+    config.check()?;
+    let own = QuickFitConfig { gaussians: cloud.len(), ..config.clone() };
+    fit(seen, Some(cloud), &own.config(seed), progress)
+}
+
+/// `cloud` as `2^depth` Gaussians in the order of its level-of-detail tree, axes labelled by the world's: as the network
+/// takes and makes them.
+///
+/// # Errors
+/// For a cloud that is empty or not finite.
+pub fn tree_slice(cloud: &Cloud, depth: u32) -> Result<Cloud, FitError> {
+    Ok(LodTree::build_to_depth(cloud, depth, Alignment::Identity)?.slice(depth)?)
+}

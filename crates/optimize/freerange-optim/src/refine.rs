@@ -1,0 +1,89 @@
+//! 3DGS-MCMC that goes on from a cloud that is already good: what a generated sample needs to agree with the photos.
+
+use crate::{
+    Evidence, FitError, FitProgress, RefineConfig,
+    fit::{checked, next_views, optimise},
+    hold::Hold,
+    mcmc::split,
+    objective::Objective,
+    views::Targets,
+};
+use freerange_gaussians::Cloud;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use std::ops::ControlFlow;
+
+/// Longest side, in pixels, of outlines. They come from guesses, which nobody vouches for to the pixel.
+const OUTLINES: u32 = 128;
+/// Improves a cloud's agreement with posed views, and shows more detail by more Gaussians.
+///
+/// Few views say little of the rest of the object, and Gaussians that only they judge leave the object's surface. Hence a
+/// [`Hold`](crate::HoldConfig): at every step, a picture of the cloud as it was, from somewhere around the object, is one
+/// more view to agree with, though less. `others` are more clouds of the same object. These pictures are the mean of all:
+/// where guesses differ, their mean is nearer to the truth than most. For the same reason the refinement begins with as many
+/// of them in one place as there are to be Gaussians, each fainter, so that together they show about what one alone does.
+/// Outlines, where there are any, come beside the views at every other step.
+/// `progress` hears of every step, and ends with what there is by `ControlFlow::Break`. The same input gives the same bytes.
+///
+/// # Errors
+/// If there are no views, or they differ in size from their camera; if the configuration is impossible;
+/// if the cloud is empty or not finite; or if the optimisation diverges.
+pub fn refine<'a>(
+    cloud: &Cloud,
+    others: &[Cloud],
+    seen: impl Into<Evidence<'a>>,
+    config: &RefineConfig,
+    progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
+) -> Result<Cloud, FitError> {
+    config.check()?;
+    let seen = seen.into();
+    let targets = Targets::new(seen.views, config.render_size)?;
+    let first = (config.coarse * config.steps as f64) as usize;
+    let coarse = (first > 0).then(|| Targets::new(seen.views, Some(config.coarse_size))).transpose()?;
+    let further = seen.outlines.len();
+    let size = config.render_size.map_or(OUTLINES, |size| size.min(OUTLINES));
+    let outlines = (further > 0).then(|| Targets::new(seen, Some(size))).transpose()?;
+    let clouds = std::iter::once(cloud).chain(others).map(|cloud| checked(cloud, usize::MAX));
+    let clouds = clouds.collect::<Result<Vec<_>, _>>()?;
+    let hold = Hold::new(&clouds, &config.hold)?;
+    let start = together(&clouds, config.gaussians);
+    let fit = config.fit(start.len());
+    fit.check()?;
+    let mut rng = ChaCha8Rng::seed_from_u64(config.seed);
+    // A stream of its own: the photos come in the same order with and without a hold.
+    let mut hold_rng = ChaCha8Rng::seed_from_u64(config.seed);
+    hold_rng.set_stream(1);
+    let mut queue = Vec::new();
+    // Photos have more to tell here than shape: outlines come beside them, at every other step.
+    let (mut outline_queue, mut step) = (Vec::new(), 0);
+    let more = |cloud: &Cloud, background| {
+        step += 1;
+        let outlined = outlines.as_ref().filter(|_| step % 2 == 0);
+        let outlined = outlined.map(|targets| (targets, next_views(&mut outline_queue, further, 1, &mut hold_rng)));
+        let held = next_views(&mut queue, hold.views(), 1, &mut hold_rng);
+        let (outlined, held) = rayon::join(
+            || outlined.map(|(targets, chosen)| Objective::outlines(cloud, targets, &chosen)).transpose(),
+            || held.first().map(|&view| hold.objective(cloud, view, background)).transpose(),
+        );
+        Ok(outlined?.into_iter().chain(held?).collect())
+    };
+    let of_step = |step| coarse.as_ref().filter(|_| step < first).unwrap_or(&targets);
+    optimise(start, of_step, &fit, &mut rng, more, progress)
+}
+
+/// As many of `clouds` as `most` Gaussians allow, but the first in any case, in one place. Each Gaussian becomes what relocation
+/// makes of one of so many copies: were the clouds equal, they would look as one.
+fn together(clouds: &[Cloud], most: usize) -> Cloud {
+    let mut total = 0;
+    let fitting = clouds.iter().take_while(|cloud| {
+        total += cloud.len();
+        total <= most
+    });
+    let copies = fitting.count();
+    if copies < 2 {
+        return clouds[0].clone();
+    }
+    let mut all = Cloud::from_rows(clouds[..copies].iter().flat_map(Cloud::rows).copied().collect());
+    (0..all.len()).for_each(|i| split(&mut all, i, copies));
+    all
+}

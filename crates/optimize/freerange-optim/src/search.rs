@@ -1,0 +1,243 @@
+//! What searches for symmetries of an object have in common: the hull of its outlines, fits that are told of, and how unlike views are what a
+//! symmetry makes of them.
+
+use std::{f64::consts::PI, ops::ControlFlow};
+
+use freerange_gaussians::Cloud;
+use freerange_raster::render;
+use freerange_scene::camera::Camera;
+use glam::DVec3;
+use rayon::prelude::*;
+
+use crate::{Evidence, FitError, FitProgress, QuickFitConfig, quick::polish, quick_fit, views::Targets};
+
+/// Longest side, in pixels, of the outlines that symmetries are judged by.
+pub(crate) const OUTLINE: u32 = 64;
+/// Longest side, in pixels, of the pictures that they are judged by.
+pub(crate) const PICTURE: u32 = 128;
+/// Cells along each side of the cube of the visual hull.
+const CELLS: usize = 44;
+/// Half the side of that cube: a little more than the radius of an object in the canonical frame.
+const HALF: f64 = 0.52;
+/// Part of the outlines that what a symmetry leaves of the hull may not fill.
+pub(crate) const UNCOVERED: f64 = 0.01;
+/// How often a symmetry is put in its place by its own fit, and the fit goes on.
+pub(crate) const ROUNDS: usize = 3;
+/// How many are judged at once.
+const TOGETHER: usize = 8;
+
+/// What leaves an object as it is.
+pub(crate) trait Symmetry: Copy + Send + Sync {
+    /// Whether it makes a left hand a right one.
+    const MIRRORS: bool;
+    /// In how many ways it can be [moved](Self::moved).
+    const WAYS: usize;
+    /// From where the object looks as it does from `camera` (mirrored, where it mirrors).
+    fn cameras(&self, camera: &Camera) -> Vec<Camera>;
+    /// A little elsewhere: turned by `step` radians, or shifted by half of that.
+    fn moved(&self, way: usize, step: f64) -> Self;
+}
+
+/// A search that tells how far it is. What it is asked for is none where it was ended.
+pub(crate) struct Search<'a, P> {
+    pub progress: &'a mut P,
+    pub seed: u64,
+    pub done: usize,
+}
+
+impl<P: FnMut(usize) -> ControlFlow<()>> Search<'_, P> {
+    /// A quick fit, or one that goes on from `start`.
+    pub fn fitted<'b>(
+        &mut self,
+        start: Option<&Cloud>,
+        seen: impl Into<Evidence<'b>>,
+        config: &QuickFitConfig,
+    ) -> Result<Option<Cloud>, FitError> {
+        let mut ended = false;
+        let tell = |p: &FitProgress<'_>| {
+            let told = (self.progress)(self.done + p.step);
+            ended = told.is_break();
+            told
+        };
+        let cloud = match start {
+            None => quick_fit(seen, config, self.seed, tell)?,
+            Some(start) => polish(start, seen, config, self.seed, tell)?,
+        };
+        self.done += config.iterations;
+        Ok((!ended).then_some(cloud))
+    }
+
+    /// What `judge` says of each. It is asked again and again whether to go on, without being further.
+    pub fn each<S: Symmetry>(
+        &mut self,
+        all: Vec<S>,
+        judge: impl Fn(S) -> Result<(f64, S), FitError> + Sync,
+    ) -> Result<Option<Vec<(f64, S)>>, FitError> {
+        let mut judged = Vec::with_capacity(all.len());
+        for some in all.chunks(TOGETHER) {
+            judged.extend(some.par_iter().map(|&one| judge(one)).collect::<Result<Vec<_>, _>>()?);
+            if (self.progress)(self.done).is_break() {
+                return Ok(None);
+            }
+        }
+        Ok(Some(judged))
+    }
+}
+
+/// A third of a fit.
+pub(crate) fn going_on(config: &QuickFitConfig) -> QuickFitConfig {
+    QuickFitConfig { iterations: config.iterations.div_ceil(ROUNDS), ..config.clone() }
+}
+
+/// The symmetry near `start` of the least `value`, and that. Moves begin with `reach` and end with `least`.
+pub(crate) fn place<S: Symmetry>(
+    start: S,
+    [reach, least]: [f64; 2],
+    value: impl Fn(&S) -> Result<f64, FitError>,
+) -> Result<(f64, S), FitError> {
+    let mut best = (value(&start)?, start);
+    let mut step = reach;
+    while step > least {
+        let mut better = false;
+        for way in 0..S::WAYS {
+            for sign in [-step, step] {
+                let next = best.1.moved(way, sign);
+                let found = value(&next)?;
+                if found < best.0 {
+                    best = (found, next);
+                    better = true;
+                    break;
+                }
+            }
+        }
+        if !better {
+            step *= 0.5;
+        }
+    }
+    Ok(best)
+}
+
+/// Mean absolute difference between a cloud and views of it, from their own cameras or from those that a symmetry makes of them: of alpha,
+/// plus, where `colors` count, that of colour times alpha.
+pub(crate) fn difference<S: Symmetry>(
+    cloud: &Cloud,
+    targets: &Targets,
+    symmetry: Option<&S>,
+    colors: bool,
+) -> Result<f64, FitError> {
+    let all: Vec<usize> = (0..targets.cameras.len()).collect();
+    let (mut sum, mut count) = (0.0, 0u32);
+    for (group, raster) in targets.groups(&all) {
+        let cameras: Vec<Vec<Camera>> = group
+            .iter()
+            .map(|&i| symmetry.map_or_else(|| vec![targets.cameras[i]], |s| s.cameras(&targets.cameras[i])))
+            .collect();
+        let copies = cameras[0].len();
+        let cameras = cameras.concat();
+        let output = render(cloud.rows(), &cameras, &vec![[0.0; 3]; cameras.len()], raster)?;
+        let (width, height) = targets.size(group[0]);
+        let rendered = output.rgb.as_chunks::<3>().0.iter().zip(&output.alpha);
+        for (index, (rgb, alpha)) in rendered.enumerate() {
+            let (image, y, x) = (group[index / (width * height) / copies], index / width % height, index % width);
+            let x = if S::MIRRORS && symmetry.is_some() { width - 1 - x } else { x };
+            let [r, g, b, a] = targets.images[image].get_pixel(x as u32, y as u32).0.map(|v| f32::from(v) / 255.0);
+            let color = (rgb[0] - a * r).abs() + (rgb[1] - a * g).abs() + (rgb[2] - a * b).abs();
+            sum += f64::from(if colors { color / 3.0 } else { 0.0 } + (alpha - a).abs());
+            count += 1;
+        }
+    }
+    Ok(sum / f64::from(count.max(1)))
+}
+
+/// What lies within the outlines of all views.
+pub(crate) struct Hull<'a> {
+    targets: &'a Targets,
+    cells: Vec<bool>,         // [CELLS, CELLS, CELLS]
+    pub points: Vec<DVec3>,   // of the cells within
+    pixels: Vec<Vec<usize>>,  // which pixel of each view shows them
+    outlines: Vec<Vec<bool>>, // what each view shows of the object
+}
+
+impl<'a> Hull<'a> {
+    pub fn new(targets: &'a Targets) -> Self {
+        let outlines: Vec<Vec<bool>> =
+            targets.images.iter().map(|image| image.pixels().map(|p| p[3] >= 128).collect()).collect();
+        let grown: Vec<Vec<bool>> = (0..outlines.len()).map(|i| grown(&outlines[i], targets.size(i))).collect();
+        let mut hull =
+            Self { targets, cells: vec![false; CELLS.pow(3)], points: Vec::new(), pixels: Vec::new(), outlines };
+        let place = |i: usize| ((i as f64 + 0.5) / CELLS as f64 * 2.0 - 1.0) * HALF;
+        for (index, cell) in hull.cells.iter_mut().enumerate() {
+            let at = [index / (CELLS * CELLS), index / CELLS % CELLS, index % CELLS];
+            let point = DVec3::from_array(at.map(place));
+            *cell = (0..grown.len()).all(|i| targets.place(i, point).is_some_and(|p| grown[i][p]));
+            if *cell {
+                hull.points.push(point);
+            }
+        }
+        let pixels = |i| hull.points.iter().map(|&p| targets.place(i, p).expect("within the hull")).collect();
+        hull.pixels = (0..targets.images.len()).map(pixels).collect();
+        hull
+    }
+
+    /// The part of the outlines that points of the hull do not fill whose `copies` all lie within the hull.
+    pub fn uncovered(&self, copies: &[impl Fn(DVec3) -> DVec3]) -> f64 {
+        let mut covered: Vec<Vec<bool>> = self.outlines.iter().map(|o| vec![false; o.len()]).collect();
+        for (i, &point) in self.points.iter().enumerate() {
+            if copies.iter().all(|copy| self.within(copy(point))) {
+                covered.iter_mut().zip(&self.pixels).for_each(|(covered, pixels)| covered[pixels[i]] = true);
+            }
+        }
+        let (mut all, mut lost) = (0, 0);
+        for (i, outline) in self.outlines.iter().enumerate() {
+            let covered = grown(&covered[i], self.targets.size(i));
+            all += outline.iter().filter(|o| **o).count();
+            lost += outline.iter().zip(covered).filter(|(o, c)| **o && !c).count();
+        }
+        lost as f64 / all.max(1) as f64
+    }
+
+    fn within(&self, point: DVec3) -> bool {
+        let at = (point / HALF + 1.0) * (0.5 * CELLS as f64);
+        let within = at.min_element() >= 0.0 && at.max_element() < CELLS as f64;
+        within && self.cells[(at.x as usize * CELLS + at.y as usize) * CELLS + at.z as usize]
+    }
+
+    /// The middle of the hull, along `direction`.
+    pub fn middle(&self, direction: DVec3) -> f64 {
+        let along = self.points.iter().map(|p| p.dot(direction));
+        let (low, high) = along.fold((f64::MAX, f64::MIN), |(l, h), x| (l.min(x), h.max(x)));
+        0.5 * (low + high)
+    }
+}
+
+/// Half a sphere of directions, fifteen degrees apart.
+pub(crate) fn normals() -> Vec<DVec3> {
+    let mut all = Vec::new();
+    for row in 0..=6 {
+        let elevation = f64::from(row) * PI / 12.0;
+        let count = if row == 6 { 1 } else { (24.0 * elevation.cos()).round() as usize };
+        let (count, turn) = if row == 0 { (12, PI) } else { (count, 2.0 * PI) };
+        for i in 0..count {
+            let azimuth = turn * i as f64 / count as f64;
+            all.push(DVec3::new(azimuth.cos() * elevation.cos(), azimuth.sin() * elevation.cos(), elevation.sin()));
+        }
+    }
+    all
+}
+
+/// A mask and the pixels beside it.
+fn grown(mask: &[bool], (width, height): (usize, usize)) -> Vec<bool> {
+    let mut out = mask.to_vec();
+    for y in 0..height {
+        for x in 0..width {
+            let i = y * width + x;
+            if mask[i] {
+                (x > 0).then(|| out[i - 1] = true);
+                (x + 1 < width).then(|| out[i + 1] = true);
+                (y > 0).then(|| out[i - width] = true);
+                (y + 1 < height).then(|| out[i + width] = true);
+            }
+        }
+    }
+    out
+}

@@ -1,0 +1,442 @@
+//! Fits of small scenes that the rasteriser itself has drawn, and what all tests share.
+
+use crate::views::Targets;
+use crate::*;
+use freerange_gaussians::{Cloud, channel};
+use freerange_raster::{RasterConfig, render};
+use freerange_scene::camera::{Camera, View};
+use glam::DVec3;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use std::ops::ControlFlow;
+
+/// `n` opaque, coloured Gaussians in a ball of radius 0.4.
+pub(crate) fn ball(n: usize, seed: u64) -> Cloud {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut cloud = Cloud::default();
+    while cloud.len() < n {
+        let mean = DVec3::from_array(std::array::from_fn(|_| rng.random_range(-0.4..0.4)));
+        if mean.length() > 0.4 {
+            continue;
+        }
+        let mut row = [0.0; channel::COUNT];
+        row[channel::MEAN].copy_from_slice(&mean.as_vec3().to_array());
+        row[channel::LOG_SCALE].fill_with(|| rng.random_range(-3.2..-2.2));
+        row[channel::ROTATION].fill_with(|| rng.random_range(-1.0..1.0));
+        row[channel::LOGIT_OPACITY] = rng.random_range(1.0..4.0);
+        row[channel::COLOR].fill_with(|| rng.random_range(0.1..0.9));
+        cloud.push(&row);
+    }
+    cloud
+}
+
+/// Cameras spread over a sphere of radius 1.5 (a Fibonacci spiral).
+pub(crate) fn cameras(count: usize, size: u32, turn: f64) -> Vec<Camera> {
+    (0..count)
+        .map(|i| {
+            let z = 0.8 * (1.0 - (2.0 * i as f64 + 1.0) / count as f64);
+            let angle = turn + 2.399_963 * i as f64;
+            let r = (1.0 - z * z).sqrt();
+            let eye = 1.5 * DVec3::new(r * angle.cos(), r * angle.sin(), z);
+            Camera::look_at(eye, DVec3::ZERO, DVec3::Z, 0.857, size, size)
+        })
+        .collect()
+}
+
+/// The cloud as seen by a camera, with straight alpha.
+pub(crate) fn photograph(cloud: &Cloud, camera: &Camera) -> View {
+    let out = render(cloud.rows(), &[*camera], &[[0.0; 3]], &RasterConfig::default()).unwrap();
+    let mut image = image::RgbaImage::new(camera.width, camera.height);
+    for (i, pixel) in image.pixels_mut().enumerate() {
+        let alpha = out.alpha[i];
+        for c in 0..3 {
+            pixel[c] = (out.rgb[3 * i + c] / alpha.max(1e-6) * 255.0).round() as u8;
+        }
+        pixel[3] = (alpha * 255.0).round() as u8;
+    }
+    View { name: "view".into(), camera: *camera, image }
+}
+
+/// Many outlines may share one picture, which is shrunk once.
+#[test]
+fn outlines_share_pictures() {
+    let mut views = ring(2, 24, &ball(12, 1));
+    views[1] = ring(2, 40, &ball(12, 1)).remove(1);
+    let from = cameras(3, 24, 1.0);
+    let outlines = from.iter().zip([1, 0, 1]).map(|(camera, of)| {
+        let (width, height) = views[of].image.dimensions();
+        Outline { camera: camera.resized(width, height), ..Outline::from(&views[of]) }
+    });
+    let targets = Targets::new(Evidence { views: &views, outlines: outlines.collect() }, Some(32)).unwrap();
+    assert_eq!((targets.views, targets.cameras.len()), (2, 5));
+    for (i, (of, size)) in [(0, 24), (1, 32), (1, 32), (0, 24), (1, 32)].into_iter().enumerate() {
+        let expected = freerange_scene::camera::image_ops::resize_area(&views[of].image, size, size);
+        assert_eq!(targets.images[i], expected, "{i}");
+        let camera = if i < 2 { views[of].camera } else { from[i - 2] };
+        assert!(targets.cameras[i].world_to_camera == camera.world_to_camera, "{i}");
+        let found = &targets.cameras[i];
+        assert!(found.width == size && (found.fx - camera.resized(size, size).fx).abs() < 1e-9, "{i}: {found:?}");
+    }
+    let wrong = Outline { camera: from[0], ..Outline::from(&views[1]) };
+    let refused = Targets::new(Evidence { views: &views[..1], outlines: vec![wrong] }, None).err().unwrap();
+    assert!(matches!(refused, FitError::View { field: "image", .. }), "{refused}");
+}
+
+/// What searches for symmetries begin with.
+pub(crate) fn own(views: &[View], config: &QuickFitConfig) -> Cloud {
+    quick_fit(views, config, 0, go).unwrap()
+}
+
+/// Views of the cloud from all around.
+pub(crate) fn ring(count: usize, size: u32, cloud: &Cloud) -> Vec<View> {
+    cameras(count, size, 0.0).iter().map(|c| photograph(cloud, c)).collect()
+}
+
+/// Mean PSNR in dB of the cloud against views, over white.
+fn psnr(cloud: &Cloud, views: &[View]) -> f64 {
+    let values = views.iter().map(|v| {
+        let out = render(cloud.rows(), &[v.camera], &[[1.0; 3]], &RasterConfig::default()).unwrap();
+        let shown: Vec<f32> = out.rgb.iter().map(|v| v.clamp(0.0, 1.0)).collect();
+        freerange_raster::metrics::psnr(&shown, &freerange_scene::camera::image_ops::composite(&v.image, [1.0; 3]))
+            .unwrap()
+    });
+    values.sum::<f64>() / views.len() as f64
+}
+
+pub(crate) fn go(_: &FitProgress<'_>) -> ControlFlow<()> {
+    ControlFlow::Continue(())
+}
+
+fn small() -> FitConfig {
+    FitConfig {
+        iterations: 800,
+        cap_max: 200,
+        initial: 100,
+        growth_start: 100,
+        refine_every: 50,
+        growth: 1.1,
+        ..Default::default()
+    }
+}
+
+#[test]
+fn a_fit_shows_unseen_views() {
+    let scene = ball(60, 11);
+    let held_out: Vec<View> = cameras(5, 48, 1.0).iter().map(|c| photograph(&scene, c)).collect();
+    let mut counts = vec![];
+    let fitted = fit(&ring(12, 48, &scene), None, &small(), |p| {
+        counts.push(p.gaussians);
+        ControlFlow::Continue(())
+    })
+    .unwrap();
+    assert_eq!(counts.len(), 800);
+    assert_eq!((counts[0], fitted.len()), (100, 200));
+    let found = psnr(&fitted, &held_out);
+    assert!(found > 25.0, "{found} dB");
+    for row in &fitted {
+        let length: f32 = row[channel::ROTATION].iter().map(|v| v * v).sum();
+        assert!((length - 1.0).abs() < 1e-5);
+    }
+}
+
+#[test]
+fn the_same_seed_gives_the_same_bytes() {
+    let views = ring(4, 24, &ball(30, 4));
+    let config = FitConfig { iterations: 150, views_per_step: 3, ..small() };
+    let run = |seed| fit(&views, None, &FitConfig { seed, ..config.clone() }, go).unwrap();
+    assert_eq!(run(1), run(1));
+    assert_ne!(run(1), run(2));
+    let refined = |seed| {
+        let config = RefineConfig { steps: 20, gaussians: 60, hold: small_hold(), seed, ..Default::default() };
+        refine(&ball(30, 5), &[], &views, &config, go).unwrap()
+    };
+    assert_eq!(refined(1), refined(1));
+    assert_ne!(refined(1), refined(2));
+}
+
+#[test]
+fn a_fit_can_start_from_a_cloud_and_stop_early() {
+    let scene = ball(30, 4);
+    let views = ring(4, 24, &scene);
+    let mut steps = 0;
+    let stopped = fit(&views, Some(&scene), &small(), |p| {
+        steps = p.step;
+        if p.step == 3 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    })
+    .unwrap();
+    assert_eq!((steps, stopped.len()), (3, 30));
+    assert!(psnr(&stopped, &views) > 25.0);
+}
+
+#[test]
+fn polishing_keeps_the_number_and_comes_nearer() {
+    let scene = ball(30, 4);
+    let views = ring(4, 32, &scene);
+    let rough = disturbed(&scene, 9);
+    let mut steps = 0;
+    let config = QuickFitConfig { iterations: 150, gaussians: 7, render_size: 32 };
+    let polished = polish(&rough, &views, &config, 3, |p| {
+        steps = p.steps;
+        ControlFlow::Continue(())
+    })
+    .unwrap();
+    assert_eq!((steps, polished.len()), (150, 30));
+    let [before, after] = [&rough, &polished].map(|cloud| psnr(cloud, &views));
+    assert!(after > before + 2.0, "{before} dB, polished {after} dB");
+    assert!(polish(&Cloud::default(), &views, &config, 3, go).is_err());
+}
+
+/// A cloud as a generator might give it: right on the whole, wrong in detail.
+fn evidence<'a>(views: &'a [View], outlines: &'a [View]) -> Evidence<'a> {
+    Evidence { views, outlines: outlines.iter().map(Outline::from).collect() }
+}
+
+/// Outlines from further places mend the shape, and tell no colours.
+#[test]
+fn outlines_are_fitted_to() {
+    let scene = ball(40, 12);
+    let photos: Vec<View> = cameras(3, 32, 0.2).iter().map(|c| photograph(&scene, c)).collect();
+    let outlines = ring(12, 32, &scene);
+    let config = FitConfig { iterations: 300, cap_max: 100, ..small() };
+    let seen = |outlines| evidence(&photos, outlines);
+    let alone = fit(&photos, None, &config, go).unwrap();
+    let helped = fit(seen(&outlines), None, &config, go).unwrap();
+    let apart = |cloud: &Cloud| {
+        let views = cameras(5, 32, 1.0).into_iter().map(|c| (photograph(&scene, &c), photograph(cloud, &c)));
+        let each = views.map(|(a, b)| {
+            let pixels = a.image.pixels().zip(b.image.pixels());
+            pixels.map(|(a, b)| f64::from(a[3].abs_diff(b[3]))).sum::<f64>()
+        });
+        each.sum::<f64>()
+    };
+    assert!(apart(&helped) < 0.7 * apart(&alone), "{} {}", apart(&helped), apart(&alone));
+    let config_of_refinement = RefineConfig { steps: 200, gaussians: 100, ..RefineConfig::default() };
+    let [plain, outlined] =
+        [&[][..], &outlines].map(|outlines| refine(&alone, &[], seen(outlines), &config_of_refinement, go).unwrap());
+    assert!(apart(&outlined) < 0.8 * apart(&plain), "{} {}", apart(&outlined), apart(&plain));
+    let mut grey = outlines.clone();
+    grey.iter_mut().for_each(|view| view.image.pixels_mut().for_each(|p| p.0 = [9, 99, 199, p[3]]));
+    let other = fit(seen(&grey), None, &config, go).unwrap();
+    assert_eq!(other, helped);
+    assert!(matches!(fit(evidence(&[], &outlines), None, &config, go), Err(FitError::NoViews)));
+}
+
+fn disturbed(cloud: &Cloud, seed: u64) -> Cloud {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut out = cloud.clone();
+    for row in out.iter_mut() {
+        row[channel::MEAN].iter_mut().for_each(|v| *v += rng.random_range(-0.02..0.02));
+        row[channel::LOG_SCALE].iter_mut().for_each(|v| *v += rng.random_range(-0.3..0.3));
+        row[channel::COLOR].iter_mut().for_each(|v| *v += rng.random_range(-0.15..0.15));
+    }
+    out
+}
+
+fn small_hold() -> HoldConfig {
+    HoldConfig { size: 48, ..Default::default() }
+}
+
+#[test]
+fn refining_helps_seen_and_unseen_views() {
+    let scene = ball(60, 21);
+    let start = disturbed(&scene, 22);
+    let views = ring(4, 64, &scene);
+    let held_out: Vec<View> = cameras(6, 64, 0.5).iter().map(|c| photograph(&scene, c)).collect();
+    let config = RefineConfig { steps: 300, gaussians: 90, hold: small_hold(), ..Default::default() };
+    let mut seen = vec![];
+    let refined = refine(&start, &[], &views, &config, |p| {
+        seen.push((p.step, p.gaussians));
+        ControlFlow::Continue(())
+    })
+    .unwrap();
+    assert_eq!((seen[0], seen[299], refined.len()), ((1, 60), (300, 90), 90));
+    assert!(refined.check_finite().is_ok());
+    for views in [&views, &held_out] {
+        let (before, after) = (psnr(&start, views), psnr(&refined, views));
+        assert!(after > before + 2.0, "{before} dB, then {after} dB");
+    }
+    // With fewer Gaussians asked for than there are, their number stays.
+    let config = RefineConfig { steps: 3, gaussians: 10, ..config };
+    assert_eq!(refine(&start, &[], &views, &config, go).unwrap().len(), 60);
+}
+
+/// Coarse steps see what a refinement at their size sees, and the others all there is.
+#[test]
+fn refining_may_begin_with_small_pictures() {
+    let scene = ball(60, 21);
+    let (start, views) = (disturbed(&scene, 22), ring(4, 64, &scene));
+    let refined = |coarse, coarse_size, render_size| {
+        let (render_size, hold) = (Some(render_size), small_hold());
+        let config =
+            RefineConfig { steps: 20, gaussians: 90, coarse, coarse_size, render_size, hold, ..Default::default() };
+        refine(&start, &[], &views, &config, go).unwrap()
+    };
+    let (small, whole) = (refined(0.0, 1, 32), refined(0.0, 1, 64));
+    assert_eq!(refined(1.0, 32, 64).rows(), small.rows());
+    // The views have 64 pixels.
+    assert_eq!(refined(1.0, 1000, 64).rows(), whole.rows());
+    let both = refined(0.5, 32, 64);
+    assert!(both.rows() != small.rows() && both.rows() != whole.rows());
+}
+
+/// Refined together, equal clouds look as one does, and there are no more Gaussians than were asked for.
+#[test]
+fn clouds_are_refined_together() {
+    let scene = ball(60, 21);
+    let start = disturbed(&scene, 22);
+    let (views, alone) = (ring(4, 64, &scene), ring(4, 64, &start));
+    let begun = |others: &[Cloud], gaussians| {
+        let hold = small_hold();
+        // Too slow to move anything.
+        let rates = Rates { mean: 1e-9, scale: 0.0, rotation: 0.0, opacity: 0.0, color: 0.0 };
+        let config = RefineConfig {
+            steps: 1,
+            growth_rounds: 0,
+            gaussians,
+            rates,
+            final_mean_rate: 1e-9,
+            hold,
+            ..Default::default()
+        };
+        refine(&start, others, &views, &config, go).unwrap()
+    };
+    let other = disturbed(&scene, 23);
+    for (others, gaussians, expected) in [
+        (vec![], 240, 60),
+        (vec![start.clone(); 3], 240, 240),
+        (vec![start.clone(); 3], 239, 180),
+        (vec![other.clone(); 3], 100, 60),
+        (vec![other.clone()], 10, 60),
+    ] {
+        let together = begun(&others, gaussians);
+        assert_eq!(together.len(), expected);
+        assert!(psnr(&together, &alone) > 30.0, "{expected}: {} dB", psnr(&together, &alone));
+    }
+    // What others show is there, too.
+    let (both, beside) = (begun(std::slice::from_ref(&other), 120), ring(4, 64, &other));
+    assert!(psnr(&both, &beside) > psnr(&start, &beside) + 1.0);
+}
+
+/// All views from one side: that side gets better, and the other, which they say nothing of, stays what it was.
+#[test]
+fn a_hold_keeps_the_unseen_side() {
+    let scene = ball(150, 31);
+    let start = disturbed(&scene, 32);
+    let from = |angle: f64, cloud: &Cloud| {
+        let turned = [-0.3, 0.0, 0.3].map(|turn| {
+            let (sin, cos) = (angle + turn).sin_cos();
+            Camera::look_at(1.5 * DVec3::new(cos, sin, turn), DVec3::ZERO, DVec3::Z, 0.857, 64, 64)
+        });
+        turned.map(|c| photograph(cloud, &c))
+    };
+    let (photos, behind) = (from(0.0, &scene), from(std::f64::consts::PI, &start));
+    let refined = |weight| {
+        let hold = HoldConfig { weight, ..small_hold() };
+        refine(&start, &[], &photos, &RefineConfig { gaussians: 200, hold, ..Default::default() }, go).unwrap()
+    };
+    let (held, free) = (refined(0.5), refined(0.0));
+    let gain = psnr(&held, &photos) - psnr(&start, &photos);
+    assert!(gain > 4.0, "{gain} dB");
+    let (held, free) = (psnr(&held, &behind), psnr(&free, &behind));
+    assert!(held > 28.0 && held > free + 3.0, "agreement with the start: {held} dB held, {free} dB without");
+}
+
+/// Guesses that err differently: where no view looks, their mean is nearer to the truth than each of them.
+#[test]
+fn other_guesses_help_on_the_unseen_side() {
+    let scene = ball(150, 31);
+    let from = |angle: f64| {
+        let turned = [-0.3, 0.0, 0.3].map(|turn| {
+            let (sin, cos) = (angle + turn).sin_cos();
+            Camera::look_at(1.5 * DVec3::new(cos, sin, turn), DVec3::ZERO, DVec3::Z, 0.857, 64, 64)
+        });
+        turned.map(|c| photograph(&scene, &c))
+    };
+    let (photos, behind) = (from(0.0), from(std::f64::consts::PI));
+    let guesses: Vec<Cloud> = (32..36).map(|seed| disturbed(&scene, seed)).collect();
+    let refined = |others: &[Cloud]| {
+        let hold = HoldConfig { weight: 0.5, ..small_hold() };
+        refine(&guesses[0], others, &photos, &RefineConfig { gaussians: 200, hold, ..Default::default() }, go).unwrap()
+    };
+    let (alone, together) = (psnr(&refined(&[]), &behind), psnr(&refined(&guesses[1..]), &behind));
+    assert!(together > alone + 1.0, "{alone} dB alone, {together} dB together");
+}
+
+/// Photos of several cameras, upright and lying.
+#[test]
+fn views_may_have_any_size() {
+    let scene = ball(60, 21);
+    let mut photos = cameras(4, 64, 0.0);
+    for (camera, (w, h)) in photos.iter_mut().zip([(64, 64), (96, 64), (48, 80), (200, 150)]) {
+        let (scale, side) = (f64::from(w.min(h)) / 64.0, [w, h].map(f64::from));
+        *camera = Camera {
+            width: w,
+            height: h,
+            fx: scale * camera.fx,
+            fy: scale * camera.fy,
+            cx: side[0] / 2.0 + 3.0,
+            cy: side[1] / 2.0,
+            ..*camera
+        };
+    }
+    let photos: Vec<View> = photos.iter().map(|c| photograph(&scene, c)).collect();
+    let held_out: Vec<View> = cameras(6, 64, 0.5).iter().map(|c| photograph(&scene, c)).collect();
+    let start = disturbed(&scene, 22);
+    let config = RefineConfig { steps: 300, gaussians: 90, hold: small_hold(), ..Default::default() };
+    let refined = refine(&start, &[], &photos, &config, go).unwrap();
+    for views in [&photos, &held_out] {
+        let (before, after) = (psnr(&start, views), psnr(&refined, views));
+        assert!(after > before + 2.0, "{before} dB, then {after} dB");
+    }
+    let fitted = fit(&photos, None, &FitConfig { views_per_step: 3, render_size: Some(64), ..small() }, go).unwrap();
+    assert!(psnr(&fitted, &photos) > 25.0, "{} dB", psnr(&fitted, &photos));
+    let centred = frame_of(&fitted, &photos).unwrap();
+    assert!(centred.translation.length() < 0.1 && (0.8..1.25).contains(&centred.scale), "{centred:?}");
+}
+
+#[test]
+fn bad_input_is_refused() {
+    let (cloud, views) = (ball(5, 1), ring(3, 16, &ball(5, 1)));
+    let fit_message = |views: &[View], cloud: Option<&Cloud>| {
+        fit(views, cloud, &FitConfig { iterations: 1, ..Default::default() }, go).unwrap_err().to_string()
+    };
+    let refine_message = |views: &[View], cloud: &Cloud| {
+        refine(cloud, &[], views, &RefineConfig::default(), go).unwrap_err().to_string()
+    };
+    let both = |views: &[View], expected: &str| {
+        for message in [fit_message(views, None), refine_message(views, &cloud)] {
+            assert!(message.contains(expected), "{message}");
+        }
+    };
+    both(&[], "no views");
+
+    let change = |change: &dyn Fn(&mut View)| {
+        let mut views = views.clone();
+        change(&mut views[1]);
+        views
+    };
+    both(&change(&|v| v.image = image::RgbaImage::new(16, 15)), "the camera's size");
+    both(&change(&|v| v.camera.fx = f64::NAN), "focal");
+    both(&change(&|v| v.camera.fy = 0.0), "focal");
+    both(&change(&|v| v.camera.world_to_camera.w_axis.x = f64::INFINITY), "rigid");
+    both(&change(&|v| v.camera.world_to_camera.x_axis *= 2.0), "rigid");
+
+    let mut broken = cloud.clone();
+    broken.rows_mut()[20] = f32::NAN;
+    for (bad, expected) in [(&broken, "NaN"), (&Cloud::default(), "no Gaussians")] {
+        for message in [fit_message(&views, Some(bad)), refine_message(&views, bad)] {
+            assert!(message.contains(expected), "{message}");
+        }
+    }
+    let large = ball(20, 1);
+    let tight = FitConfig { cap_max: 10, initial: 10, ..Default::default() };
+    assert!(fit(&views, Some(&large), &tight, go).unwrap_err().to_string().contains("20 Gaussians"));
+}
+
+#[test]
+fn divergence_is_an_error() {
+    let views = ring(2, 16, &ball(5, 1));
+    let config = FitConfig { iterations: 50, noise_lr: 1e300, ..small() };
+    let message = fit(&views, None, &config, go).unwrap_err().to_string();
+    assert!(message.contains("not finite") && message.starts_with("step"), "{message}");
+}

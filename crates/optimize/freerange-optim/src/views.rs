@@ -1,0 +1,166 @@
+//! The views as a fit sees them: checked, shrunk, and put over a background.
+
+use crate::FitError;
+use freerange_raster::RasterConfig;
+use freerange_scene::camera::{Camera, View, image_ops};
+use glam::{DMat3, DVec3};
+use image::RgbaImage;
+use rayon::prelude::*;
+
+/// What a fit is to agree with. Views alone are one, too.
+#[derive(Clone, Debug)]
+pub struct Evidence<'a> {
+    /// Posed views.
+    pub views: &'a [View],
+    /// Outlines from further places.
+    pub outlines: Vec<Outline<'a>>,
+}
+
+/// What a picture tells of an object's shape, and of that alone: its alpha. Many may share one picture.
+#[derive(Clone, Copy, Debug)]
+pub struct Outline<'a> {
+    /// Of the view that it comes from, for messages.
+    pub name: &'a str,
+    /// From where it is seen.
+    pub camera: Camera,
+    /// The picture.
+    pub image: &'a RgbaImage,
+}
+
+impl<'a> From<&'a View> for Outline<'a> {
+    fn from(view: &'a View) -> Self {
+        Self { name: &view.name, camera: view.camera, image: &view.image }
+    }
+}
+
+impl<'a> From<&'a [View]> for Evidence<'a> {
+    fn from(views: &'a [View]) -> Self {
+        Self { views, outlines: Vec::new() }
+    }
+}
+
+impl<'a> From<&'a Vec<View>> for Evidence<'a> {
+    fn from(views: &'a Vec<View>) -> Self {
+        views.as_slice().into()
+    }
+}
+
+impl<'a, const N: usize> From<&'a [View; N]> for Evidence<'a> {
+    fn from(views: &'a [View; N]) -> Self {
+        views.as_slice().into()
+    }
+}
+
+/// Views, each of its own size, and after them those of which the outline alone counts.
+pub(crate) struct Targets {
+    pub cameras: Vec<Camera>,
+    pub images: Vec<RgbaImage>,
+    /// How many of them are more than outlines.
+    pub views: usize,
+    rasters: Vec<RasterConfig>,
+}
+
+fn refuse<T>(view: &Outline<'_>, field: &'static str, expected: String, found: String) -> Result<T, FitError> {
+    Err(FitError::View { name: view.name.to_owned(), field, expected, found })
+}
+
+fn check(view: &Outline<'_>) -> Result<(), FitError> {
+    let c = &view.camera;
+    let (width, height) = view.image.dimensions();
+    if (width, height) != (c.width, c.height) {
+        let expected = format!("{} x {} pixels, the camera's size", c.width, c.height);
+        return refuse(view, "image", expected, format!("{width} x {height}"));
+    }
+    // The rasteriser's own limit.
+    if !(1..=16384).contains(&width) || !(1..=16384).contains(&height) {
+        return refuse(view, "image", "1 to 16384 pixels a side".into(), format!("{width} x {height}"));
+    }
+    let focal = |v: f64| (v as f32).is_normal() && v > 0.0;
+    if !(focal(c.fx) && focal(c.fy) && (c.cx as f32).is_finite() && (c.cy as f32).is_finite()) {
+        let found = format!("fx {}, fy {}, cx {}, cy {}", c.fx, c.fy, c.cx, c.cy);
+        return refuse(view, "camera", "finite numbers and focal lengths above 0".into(), found);
+    }
+    let rotation = DMat3::from_mat4(c.world_to_camera);
+    let rigid = (rotation * rotation.transpose()).abs_diff_eq(DMat3::IDENTITY, 1e-3);
+    let finite = c.world_to_camera.w_axis.is_finite() && c.world_to_camera.w_axis.abs().max_element() < 1e15;
+    if !(rigid && finite) {
+        return refuse(view, "world_to_camera", "a rigid transform".into(), format!("{:?}", c.world_to_camera));
+    }
+    Ok(())
+}
+
+impl Targets {
+    /// Checks the views and shrinks those whose longest side exceeds `size`.
+    pub fn new<'a>(seen: impl Into<Evidence<'a>>, size: Option<u32>) -> Result<Self, FitError> {
+        let seen = seen.into();
+        if seen.views.is_empty() {
+            return Err(FitError::NoViews);
+        }
+        let all: Vec<Outline<'_>> = seen.views.iter().map(Outline::from).chain(seen.outlines).collect();
+        all.iter().try_for_each(check)?;
+        // Each picture once, however many share it.
+        let mut pictures: Vec<&RgbaImage> = Vec::new();
+        let of: Vec<usize> = all
+            .iter()
+            .map(|one| {
+                pictures.iter().position(|known| std::ptr::eq(*known, one.image)).unwrap_or_else(|| {
+                    pictures.push(one.image);
+                    pictures.len() - 1
+                })
+            })
+            .collect();
+        let small = |image: &RgbaImage| {
+            let full = image.dimensions();
+            let (w, h) = size.map_or(full, |size| image_ops::shrunk_size(full, size));
+            let longest = |(w, h): (u32, u32)| w.max(h) as f32;
+            let raster = RasterConfig::default().shrunk(longest((w, h)) / longest(full));
+            (image_ops::resize_area(image, w, h), raster)
+        };
+        let (pictures, rasters): (Vec<RgbaImage>, Vec<RasterConfig>) = pictures.into_par_iter().map(small).unzip();
+        let cameras = all.iter().zip(&of).map(|(one, &of)| {
+            let (w, h) = pictures[of].dimensions();
+            one.camera.resized(w, h)
+        });
+        Ok(Self {
+            cameras: cameras.collect(),
+            images: of.iter().map(|&of| pictures[of].clone()).collect(),
+            views: seen.views.len(),
+            rasters: of.iter().map(|&of| rasters[of]).collect(),
+        })
+    }
+
+    /// The views `chosen`, in groups that can be rendered together (one size, one blur), and how to render these.
+    pub fn groups<'a>(&'a self, chosen: &'a [usize]) -> impl Iterator<Item = (&'a [usize], &'a RasterConfig)> {
+        let kind = |i: usize| (self.images[i].dimensions(), self.rasters[i].blur.to_bits());
+        chosen.chunk_by(move |&a, &b| kind(a) == kind(b)).map(|group| (group, &self.rasters[group[0]]))
+    }
+
+    /// Width and height of view `i` in pixels.
+    pub fn size(&self, i: usize) -> (usize, usize) {
+        let (w, h) = self.images[i].dimensions();
+        (w as usize, h as usize)
+    }
+
+    /// View `i` over `background`, `[h, w, 3]`.
+    pub fn composite(&self, i: usize, background: [f32; 3]) -> Vec<f32> {
+        image_ops::composite(&self.images[i], background)
+    }
+
+    /// The pixel of view `i` that shows `point`, straight RGBA; none outside the image or behind the camera.
+    pub fn pixel(&self, i: usize, point: DVec3) -> Option<[u8; 4]> {
+        let (width, _) = self.size(i);
+        let place = self.place(i, point)?;
+        Some(self.images[i].get_pixel((place % width) as u32, (place / width) as u32).0)
+    }
+
+    /// Where that pixel is, row by row.
+    pub fn place(&self, i: usize, point: DVec3) -> Option<usize> {
+        let c = &self.cameras[i];
+        let p = c.world_to_camera.transform_point3(point);
+        let (x, y) = (c.fx * p.x / p.z + c.cx, c.fy * p.y / p.z + c.cy);
+        // Phrased so that NaN fails it.
+        let (width, height) = self.size(i);
+        let inside = p.z > 0.0 && x >= 0.0 && y >= 0.0 && x < width as f64 && y < height as f64;
+        inside.then(|| y as usize * width + x as usize)
+    }
+}

@@ -1,0 +1,190 @@
+//! The jobs: who waits, who computes, what is there of each.
+
+mod arriving;
+mod orders;
+mod shown;
+mod table;
+mod work;
+
+use std::{
+    fs::{self, File, TryLockError},
+    path::{Path, PathBuf},
+    sync::{
+        Arc, Condvar, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicBool, Ordering::Relaxed},
+    },
+    time::Instant,
+};
+
+use freerange_util::IoError;
+
+use self::table::{Job, Table};
+use crate::{
+    Engine, Limits, Refusal, ServeError,
+    metrics::Metrics,
+    record::{Record, State},
+    scene,
+};
+
+/// All jobs of a server.
+pub struct Board {
+    root: PathBuf,
+    temporary: Mutex<Option<tempfile::TempDir>>,
+    keeps: bool,
+    lock: File,
+    limits: Limits,
+    engine: Arc<dyn Engine>,
+    table: Mutex<Table>,
+    changed: Condvar,
+    mending: Mutex<()>,
+    stopping: AtomicBool,
+    pub metrics: Metrics,
+}
+
+impl Board {
+    /// Opens the folder of jobs, and finds what an earlier server left there.
+    pub fn open(keep: Option<&Path>, limits: Limits, engine: Arc<dyn Engine>) -> Result<Self, ServeError> {
+        let (root, temporary) = match keep {
+            Some(folder) => {
+                fs::create_dir_all(folder).map_err(IoError::at(folder))?;
+                (folder.to_path_buf(), None)
+            }
+            None => {
+                let folder = tempfile::Builder::new().prefix("freerange-serve-").tempdir();
+                let folder = folder.map_err(IoError::at(&std::env::temp_dir()))?;
+                (folder.path().to_path_buf(), Some(folder))
+            }
+        };
+        let lock_path = root.join(".freerange-serve.lock");
+        let lock = File::create(&lock_path).map_err(IoError::at(&lock_path))?;
+        match lock.try_lock() {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => {
+                let source = std::io::Error::other("another server keeps its jobs here");
+                return Err(IoError { path: root, source }.into());
+            }
+            Err(TryLockError::Error(e)) => return Err(IoError::at(&lock_path)(e).into()),
+        }
+        let board = Self {
+            keeps: keep.is_some(),
+            root,
+            temporary: Mutex::new(temporary),
+            lock,
+            limits,
+            engine,
+            table: Mutex::default(),
+            changed: Condvar::new(),
+            mending: Mutex::new(()),
+            stopping: AtomicBool::new(false),
+            metrics: Metrics::new(),
+        };
+        board.recover().map_err(IoError::at(&board.root))?;
+        Ok(board)
+    }
+
+    /// Takes over what an earlier server left: finished and waiting jobs as they are, others as interrupted.
+    fn recover(&self) -> std::io::Result<()> {
+        let mut table = self.table();
+        for entry in fs::read_dir(&self.root)? {
+            let entry = entry?;
+            let Ok(id) = entry.file_name().into_string() else { continue };
+            if !is_id(&id) || !entry.file_type()?.is_dir() {
+                continue;
+            }
+            let folder = entry.path();
+            let mut record = match Record::read(&folder) {
+                Ok(record) if record.id == id => record,
+                // Nothing but files on their way is without a record; ours to clear away.
+                Err(e) if e.kind() == std::io::ErrorKind::NotFound && uploads(&folder).is_dir() => {
+                    clear(&folder);
+                    continue;
+                }
+                Ok(_) => continue,
+                Err(e) => {
+                    tracing::warn!("{}: {e}", crate::record::file(&folder).display());
+                    continue;
+                }
+            };
+            clear(&uploads(&folder));
+            if matches!(record.state, State::Uploading | State::Reading | State::Running) {
+                let again = if scene::is_whole(&folder) {
+                    "press go to compute it again"
+                } else {
+                    "its photos have to be given again"
+                };
+                record.error = Some(format!("the server ended while this job was {}: {again}", record.state.name()));
+                record.state = State::Interrupted;
+                record.write(&folder)?;
+            }
+            table.turns = table.turns.max(record.turn);
+            let job = table.job(record, folder);
+            table.jobs.insert(id, job);
+        }
+        Ok(())
+    }
+
+    fn table(&self) -> MutexGuard<'_, Table> {
+        self.table.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    pub fn engine_name(&self) -> String {
+        self.engine.name()
+    }
+
+    pub fn limits(&self) -> &Limits {
+        &self.limits
+    }
+
+    /// Changes a job under the lock, writes its record, and tells everyone who looks.
+    fn change<T>(&self, id: &str, change: impl FnOnce(&mut Job) -> Result<T, Refusal>) -> Result<T, Refusal> {
+        let mut table = self.table();
+        let version = table.next_version();
+        let job = table.jobs.get_mut(id).ok_or_else(no_such)?;
+        let result = change(job)?;
+        (job.version, job.touched) = (version, Instant::now());
+        job.record.write(&job.folder).map_err(Refusal::own)?;
+        self.changed.notify_all();
+        Ok(result)
+    }
+
+    /// Ends: whoever waits hears of it, whoever computes stops.
+    pub fn stop(&self) {
+        self.stopping.store(true, Relaxed);
+        let table = self.table();
+        table.jobs.values().for_each(|j| j.cancel.store(true, Relaxed));
+        self.changed.notify_all();
+    }
+
+    /// Takes a temporary folder away, after all threads that use it have ended.
+    pub fn close(&self) {
+        let folder = self.temporary.lock().unwrap_or_else(PoisonError::into_inner).take();
+        if let Some(Err(e)) = folder.map(tempfile::TempDir::close) {
+            tracing::warn!("{}: {e}", self.root.display());
+        }
+        // Threads of slow clients may live a little longer than the server.
+        if let Err(e) = self.lock.unlock() {
+            tracing::warn!("{}: {e}", self.root.display());
+        }
+    }
+}
+
+fn clear(folder: &Path) {
+    if let Err(e) = fs::remove_dir_all(folder)
+        && e.kind() != std::io::ErrorKind::NotFound
+    {
+        tracing::warn!("{}: {e}", folder.display());
+    }
+}
+
+fn uploads(folder: &Path) -> PathBuf {
+    folder.join("upload")
+}
+
+fn no_such() -> Refusal {
+    Refusal::new(404, "there is no such job")
+}
+
+/// Whether a text can be a job's.
+pub fn is_id(text: &str) -> bool {
+    text.len() == 16 && text.bytes().all(|b| b.is_ascii_digit() || (b'a'..=b'f').contains(&b))
+}

@@ -1,0 +1,136 @@
+//! Limits and places of the server.
+
+use std::{net::IpAddr, path::PathBuf, time::Duration};
+
+use freerange_util::Invalid;
+
+use crate::ServeError;
+
+/// How a server is set up.
+#[derive(Clone, Debug)]
+pub struct ServeConfig {
+    /// Where it listens; beyond loopback it needs a token.
+    pub host: IpAddr,
+    /// 0 takes a free one.
+    pub port: u16,
+    /// What clients have to know.
+    pub token: Option<String>,
+    /// Names, beside addresses, under which browsers may reach it.
+    pub names: Vec<String>,
+    /// Where jobs are kept; a temporary folder where it is left out.
+    pub keep: Option<PathBuf>,
+    /// A scene for those who have none at hand.
+    pub example: Option<Example>,
+    /// What clients may ask for.
+    pub limits: Limits,
+}
+
+/// Files of a scene that is part of the program.
+#[derive(Clone, Copy, Debug)]
+pub struct Example {
+    /// What it is called.
+    pub name: &'static str,
+    /// Names and bytes of its files.
+    pub files: &'static [(&'static str, &'static [u8])],
+}
+
+/// What clients may ask for at most.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Limits {
+    /// Bytes of all files of a job.
+    pub bytes: u64,
+    /// Bytes of one file.
+    pub file_bytes: u64,
+    /// Files of a job.
+    pub files: usize,
+    /// Pixels of one picture.
+    pub pixels: u64,
+    /// Pixels of all pictures of a job.
+    pub job_pixels: u64,
+    /// Longer side of the photos in use; larger ones are made smaller.
+    pub side: u32,
+    /// Jobs that are read, looked at, wait or compute.
+    pub open_jobs: usize,
+    /// Finished jobs. Beyond that, new ones are refused where jobs are kept, else the oldest is forgotten.
+    pub finished_jobs: usize,
+    /// A job that computes longer is ended.
+    pub job_time: Duration,
+    /// A job that waits longer for someone to press go makes way where there is no room for new ones.
+    pub idle_time: Duration,
+    /// A request that takes longer is ended.
+    pub request_time: Duration,
+    /// A head of a request that takes longer is ended.
+    pub head_time: Duration,
+    /// Connections at a time.
+    pub connections: usize,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self {
+            bytes: 512 << 20,
+            file_bytes: 64 << 20,
+            files: 1000,
+            pixels: 50_000_000,
+            job_pixels: 1_000_000_000,
+            side: 1024,
+            open_jobs: 32,
+            finished_jobs: 200,
+            job_time: Duration::from_secs(900),
+            idle_time: Duration::from_secs(600),
+            request_time: Duration::from_secs(300),
+            head_time: Duration::from_secs(10),
+            connections: 96,
+        }
+    }
+}
+
+/// Shortest token.
+const TOKEN: usize = 16;
+
+impl Default for ServeConfig {
+    fn default() -> Self {
+        Self {
+            host: IpAddr::from([127, 0, 0, 1]),
+            port: 0,
+            token: None,
+            names: Vec::new(),
+            keep: None,
+            example: None,
+            limits: Limits::default(),
+        }
+    }
+}
+
+impl ServeConfig {
+    /// Refuses what would not be safe.
+    ///
+    /// # Errors
+    /// Names the option.
+    pub fn check(&self) -> Result<(), ServeError> {
+        let refuse = |option: &str, expected: String, found: String| Err(Invalid::new(option, expected, found).into());
+        match &self.token {
+            None if !self.host.is_loopback() => refuse(
+                "--token",
+                format!("a secret of {TOKEN} characters or more, to listen at {}", self.host),
+                "none".into(),
+            ),
+            Some(token)
+                if token.len() < TOKEN || !token.bytes().all(|b| b.is_ascii_alphanumeric() || b"-._~".contains(&b)) =>
+            {
+                // Secrets do not belong into messages.
+                let found = format!("{} characters", token.chars().count());
+                refuse("--token", format!("{TOKEN} letters, digits or - . _ ~, or more"), found)
+            }
+            _ => Ok(()),
+        }?;
+        let odd = self
+            .names
+            .iter()
+            .find(|n| n.is_empty() || !n.bytes().all(|b| b.is_ascii_alphanumeric() || b"-.".contains(&b)));
+        match odd {
+            Some(name) => refuse("--name", "a host's name, without a port".into(), name.clone()),
+            None => Ok(()),
+        }
+    }
+}

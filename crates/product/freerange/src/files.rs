@@ -1,0 +1,75 @@
+//! Gaussians on disk, in the format that a file's extension names.
+
+use std::path::Path;
+
+use freerange_gaussians::formats::{Format, Frame, WriteOptions, read, write};
+use freerange_gaussians::{Cloud, write_ply};
+use freerange_util::Note;
+use glam::DVec3;
+
+use crate::{Error, error::Lift};
+
+/// Reads Gaussians (`.ply`, `.splat`, `.spz`, `.sog`, `.glb`, `.gltf`, `.usda`, `.usdz`). Formats that fix which way is up are
+/// turned so that `up` is. Color is what is the same from all sides; a note says what is left out.
+///
+/// # Errors
+/// Names the file, the place in it, what was expected and what was found.
+pub fn read_gaussians(path: &Path, up: DVec3) -> Result<(Cloud, Vec<Note>), Error> {
+    let loaded = read(path, frame(up)?).lift()?;
+    let mut notes: Vec<Note> = loaded.notes.into_iter().map(Note::understood).collect();
+    let degree = loaded.splats.harmonics.degree();
+    if degree > 0 {
+        let text = format!("color that depends on the viewing direction (degree {degree}) is left out");
+        notes.push(Note::dropped(text));
+    }
+    Ok((loaded.splats.into_cloud(), notes))
+}
+
+/// Writes Gaussians in whose frame `up` is up; the notes say what the format could not hold. `.ply` is written as the
+/// program writes it, in the Gaussians' own frame.
+///
+/// # Errors
+/// Names the file, or the extension that no format has.
+pub fn write_gaussians(gaussians: &Cloud, path: &Path, up: DVec3) -> Result<Vec<Note>, Error> {
+    let options = WriteOptions { frame: frame(up)?, ..WriteOptions::default() };
+    if Format::of(path).lift()? == Format::Ply {
+        write_ply(gaussians, path).lift()?;
+        return Ok(Vec::new());
+    }
+    let lost = write(&gaussians.clone().into(), path, &options).lift()?;
+    Ok(lost.into_iter().map(Note::dropped).collect())
+}
+
+fn frame(up: DVec3) -> Result<Frame, Error> {
+    Frame::with_up(up).ok_or_else(|| Error::input("up", "a direction", format!("{:?}", up.to_array())))
+}
+
+#[cfg(test)]
+mod tests {
+    use freerange_gaussians::channel;
+
+    use super::*;
+
+    #[test]
+    fn what_is_written_is_read_again_and_up_is_kept() {
+        let folder = std::env::temp_dir().join(format!("freerange-files-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        let rows = (0..4 * channel::COUNT).map(|v| (v as f32 * 0.7).sin()).collect();
+        let cloud = Cloud::from_rows(rows);
+        for name in ["a.ply", "a.splat", "a.glb"] {
+            let path = folder.join(name);
+            write_gaussians(&cloud, &path, DVec3::Z).unwrap();
+            let (same, _) = read_gaussians(&path, DVec3::Z).unwrap();
+            let apart = |i: usize| same.mean(i).distance(cloud.mean(i));
+            // Some formats sort.
+            let near = |i: usize| (0..4).any(|j| same.mean(i).distance(cloud.mean(j)) < 1e-3);
+            assert!(same.len() == 4 && (0..4).all(near), "{name}: {:?}", (0..4).map(apart).collect::<Vec<_>>());
+        }
+        let of = |name: &str, up| write_gaussians(&cloud, &folder.join(name), up).unwrap_err();
+        assert!(matches!(of("a.ply", DVec3::ZERO), Error::Input { field, .. } if field == "up"));
+        assert!(matches!(of("a.txt", DVec3::Z), Error::Gaussians(_)));
+        let missing = read_gaussians(&folder.join("none.ply"), DVec3::Z).unwrap_err();
+        assert!(matches!(missing, Error::Io { path, .. } if path.ends_with("none.ply")));
+        std::fs::remove_dir_all(folder).unwrap();
+    }
+}

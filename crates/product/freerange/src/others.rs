@@ -1,0 +1,52 @@
+//! What the other views make of each view: for masks that are estimated.
+
+use std::ops::ControlFlow;
+
+use freerange_gaussians::Cloud;
+use freerange_optim::{QuickFitConfig, quick_fit};
+use freerange_raster::RasterConfig;
+use freerange_scene::camera::{Camera, FrameConfig, View, Window};
+use image::{Rgba, RgbaImage};
+use rayon::prelude::*;
+
+use crate::{Error, error::Lift, to_canonical};
+
+/// Shows each view as a quick fit of all the others has it: straight colour and alpha, at its image's size, in the order of `views`, whose
+/// alpha is the object's mask. What one mask lacks by mistake others have, and the other way round. (`freerange_scene::estimate::OthersShow`.)
+///
+/// # Errors
+/// A sentence, where the views do not show one object from different places, or a fit diverges.
+pub fn others_show(views: &[View]) -> Result<Vec<RgbaImage>, String> {
+    shown(views).map_err(|e| e.to_string())
+}
+
+fn shown(views: &[View]) -> Result<Vec<RgbaImage>, Error> {
+    // Finer or longer fits mend no more (docs/research/experiments/masks.md).
+    let config = QuickFitConfig { iterations: 150, gaussians: 2048, render_size: 128 };
+    let (_, canonical) = to_canonical(views, &FrameConfig::default())?;
+    let framed = |v: &View| Window::framed(v).map_or_else(|| v.clone(), |w| w.cut(v).into_owned());
+    let framed: Vec<View> = canonical.iter().map(framed).collect();
+    (0..views.len())
+        .into_par_iter()
+        .map(|i| {
+            let others: Vec<View> =
+                framed.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, v)| v.clone()).collect();
+            let cloud = quick_fit(&others, &config, i as u64, |_| ControlFlow::Continue(())).lift()?;
+            picture(&cloud, &canonical[i].camera)
+        })
+        .collect()
+}
+
+/// The cloud in straight colour and alpha.
+fn picture(cloud: &Cloud, camera: &Camera) -> Result<RgbaImage, Error> {
+    let shown = freerange_raster::render(cloud.rows(), &[*camera], &[[0.0; 3]], &RasterConfig::default()).lift()?;
+    let byte = |v: f32| (255.0 * v.clamp(0.0, 1.0)).round() as u8;
+    let pixels = shown.rgb.as_chunks::<3>().0.iter().zip(&shown.alpha).map(|(rgb, &alpha)| {
+        // Over black, colours are multiplied by alpha.
+        let [r, g, b] = rgb.map(|c| byte(c / alpha.max(1e-3)));
+        Rgba([r, g, b, byte(alpha)])
+    });
+    let mut image = RgbaImage::new(camera.width, camera.height);
+    image.pixels_mut().zip(pixels).for_each(|(to, from)| *to = from);
+    Ok(image)
+}

@@ -1,0 +1,124 @@
+//! Pictures of Gaussians: single views, turntables.
+
+use std::path::Path;
+
+use freerange_gaussians::{Cloud, RenderMode, Splats};
+use freerange_raster::{MIP_BLUR, RasterConfig, mip_compensated, render};
+use freerange_scene::camera::{
+    Camera,
+    image_ops::{composite, to_picture},
+};
+use freerange_util::IoError;
+use glam::{DMat4, DVec3};
+use image::{Delay, Frame, RgbaImage, codecs::gif};
+
+use crate::{Error, error::Lift};
+
+/// The colour behind the object in everything that is measured or shown.
+pub const WHITE: [f32; 3] = [1.0; 3];
+
+/// Renders one view on white. `[h, w, 3]`, colours as in the image files (sRGB-encoded), not clamped.
+///
+/// # Errors
+/// If the rasteriser refuses the camera or the cloud.
+pub fn render_view(cloud: &Cloud, camera: &Camera) -> Result<Vec<f32>, Error> {
+    Ok(render(cloud.rows(), &[*camera], &[WHITE], &in_units_of(cloud, camera)).lift()?.rgb)
+}
+
+/// Settings with a near plane for the cloud's own units: as usual from a distance of one unit on, in proportion below.
+fn in_units_of(cloud: &Cloud, camera: &Camera) -> RasterConfig {
+    let usual = RasterConfig::default();
+    let Some((low, high)) = cloud.bounds() else { return usual };
+    let distance = camera.center().distance(0.5 * (low + high));
+    RasterConfig { near: usual.near * (distance as f32).clamp(1e-30, 1.0), ..usual }
+}
+
+/// Renders one view of Gaussians from a file on white, with colors as seen from this camera and drawn in `mode`.
+/// `[h, w, 3]`, as [`render_view`].
+///
+/// # Errors
+/// If the rasteriser refuses the camera or the cloud.
+pub fn render_splats(splats: &Splats, camera: &Camera, mode: RenderMode) -> Result<Vec<f32>, Error> {
+    let cloud = splats.seen_from(camera.center());
+    // Positions are relative to the origin, which may be far away.
+    let world_to_camera = camera.world_to_camera * DMat4::from_translation(splats.origin);
+    let camera = Camera { world_to_camera, ..*camera };
+    if mode != RenderMode::Mip {
+        return render_view(&cloud, &camera);
+    }
+    let rows = mip_compensated(cloud.rows(), &camera, MIP_BLUR);
+    let config = RasterConfig { blur: MIP_BLUR, ..RasterConfig::default() };
+    Ok(render(&rows, &[camera], &[WHITE], &config).lift()?.rgb)
+}
+
+/// An image composited on white.
+pub fn on_white(image: &RgbaImage) -> RgbaImage {
+    to_picture(&composite(image, WHITE), image.width(), image.height())
+}
+
+/// Writes an animated GIF of the cloud, which is in the canonical frame, turning once about the z axis.
+///
+/// # Errors
+/// If the file cannot be written, or the rasteriser refuses the cloud.
+pub fn write_turntable(path: &Path, cloud: &Cloud, frames: u32, size: u32) -> Result<(), Error> {
+    let file = std::fs::File::create(path).map_err(IoError::at(path)).lift()?;
+    let mut encoder = gif::GifEncoder::new_with_speed(std::io::BufWriter::new(file), 10);
+    let broken = |source: image::ImageError| Error::picture(path, source);
+    encoder.set_repeat(gif::Repeat::Infinite).map_err(broken)?;
+    for i in 0..frames {
+        let azimuth = std::f64::consts::TAU * f64::from(i) / f64::from(frames);
+        let elevation = 20f64.to_radians();
+        let direction = DVec3::new(azimuth.cos() * elevation.cos(), azimuth.sin() * elevation.cos(), elevation.sin());
+        let camera = Camera::look_at(1.6 * direction, DVec3::ZERO, DVec3::Z, 45f64.to_radians(), size, size);
+        let picture = to_picture(&render_view(cloud, &camera)?, size, size);
+        let frame = Frame::from_parts(picture, 0, 0, Delay::from_numer_denom_ms(2000, frames.max(1)));
+        encoder.encode_frame(frame).map_err(broken)?;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use freerange_gaussians::{Harmonics, channel, coefficients};
+
+    /// A few Gaussians, as small as pixels.
+    fn example(degree: usize) -> Splats {
+        let wave = |n: usize| (0..n).map(|v| (v as f32 * 0.7).sin()).collect::<Vec<_>>();
+        let mut cloud = Cloud::from_rows(wave(30 * channel::COUNT));
+        for row in cloud.iter_mut() {
+            row[channel::MEAN].iter_mut().for_each(|v| *v *= 0.4);
+            row[channel::LOG_SCALE].iter_mut().for_each(|v| *v -= 4.0);
+        }
+        let harmonics = Harmonics::from_rows(degree, wave(30 * 3 * coefficients(degree)));
+        Splats { harmonics, ..cloud.into() }
+    }
+
+    fn camera(eye: DVec3) -> Camera {
+        Camera::look_at(eye, DVec3::ZERO, DVec3::Z, 0.6, 48, 48)
+    }
+
+    fn apart(a: &[f32], b: &[f32]) -> f32 {
+        a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
+    }
+
+    #[test]
+    fn gaussians_from_files_are_drawn_with_harmonics_mode_and_origin() {
+        let (splats, camera) = (example(2), camera(DVec3::new(2.0, -1.0, 0.7)));
+        let shown = render_splats(&splats, &camera, RenderMode::Default).unwrap();
+        // What is the same from all sides is drawn as results are.
+        let constant = Splats { harmonics: Harmonics::default(), ..splats.clone() };
+        let plain = render_splats(&constant, &camera, RenderMode::Default).unwrap();
+        assert_eq!(plain, render_view(&splats.cloud, &camera).unwrap());
+        assert!(apart(&shown, &plain) > 0.1);
+        // The color from here, as the constant one.
+        let baked = Splats::from(splats.seen_from(camera.center()));
+        assert_eq!(shown, render_splats(&baked, &camera, RenderMode::Default).unwrap());
+        assert!(apart(&shown, &render_splats(&splats, &camera, RenderMode::Mip).unwrap()) > 0.02);
+
+        let far = DVec3::new(4e6, -3e6, 1e6);
+        let moved = Splats { origin: far, ..splats.clone() };
+        let there = Camera { world_to_camera: camera.world_to_camera * DMat4::from_translation(-far), ..camera };
+        assert!(apart(&shown, &render_splats(&moved, &there, RenderMode::Default).unwrap()) < 1e-3);
+    }
+}

@@ -1,0 +1,91 @@
+//! Step 3, propose. In: targets in the canonical frame. Out: `propose.count` sets of Gaussians in it, each from a seed of its
+//! own: initial fits of any number of Gaussians, samples of the learned flow (paper, Section 3.6), or the user's own.
+//!
+//! Initial fits take a second of two cores together; a sample of the flow takes 50 evaluations of the network, or 100 with
+//! classifier-free guidance.
+
+use std::ops::ControlFlow;
+
+use freerange_diffusion::sample::FlowSampler;
+use freerange_gaussians::Cloud;
+use freerange_optim::quick_fit;
+use freerange_util::side_by_side;
+
+use super::{
+    CanonicalScene, refine,
+    symmetry::Targets,
+    watch::{Watch, flow},
+};
+use crate::{Error, Init, Options, Reconstructor, Stage, error::Lift, progress::Preview};
+
+/// Numbers that one seed has for its proposals: as many as `propose.count` allows.
+const MOST: u64 = 64;
+
+/// Makes the proposals of a seed.
+pub(crate) fn propose(
+    model: &Reconstructor,
+    scene: &mut CanonicalScene,
+    targets: &Targets,
+    options: &Options,
+    seed: u64,
+    watch: &mut Watch<'_>,
+) -> Result<Vec<Cloud>, Error> {
+    let config = &options.pipeline.propose;
+    if let Some(init) = &options.init {
+        watch.report(Stage::Propose, [0, 1], None, None)?;
+        // The network refines equal proposals equally: one is enough.
+        let own = vec![scene.user_proposal(init)?];
+        watch.report(Stage::Propose, [1, 1], None, None)?;
+        return Ok(own);
+    }
+    match config.init {
+        Init::Fit => fits(scene, targets, options, seed, watch),
+        Init::Flow => {
+            let flow = &config.flow;
+            let sampler = FlowSampler { checkpoint: model.checkpoint(), config: flow, device: &model.device().0 };
+            let views = targets.network_views();
+            let sample = |member: usize, progress: &mut refine::OnEstimate<'_>| {
+                // The first is what it is without the others, which draw from far away.
+                let seed = seed.wrapping_add((member as u64) << 32);
+                Ok(sampler.sample(&[views], &[seed], progress).lift()?.remove(0))
+            };
+            refine::each(model, Stage::Propose, scene, [config.count, flow.steps], &sample, watch)
+        }
+    }
+}
+
+/// Initial fits, beside each other.
+fn fits(
+    scene: &CanonicalScene,
+    targets: &Targets,
+    options: &Options,
+    seed: u64,
+    watch: &mut Watch<'_>,
+) -> Result<Vec<Cloud>, Error> {
+    let config = &options.pipeline.propose;
+    let numbers: Vec<u64> = (0..config.count as u64).map(|i| seed.wrapping_mul(MOST).wrapping_add(i)).collect();
+    // The fit that found the object's place is that of number 0.
+    let known = |number: u64| scene.fit.as_ref().filter(|_| number == 0);
+    let total = numbers.iter().filter(|n| known(**n).is_none()).count() * config.fit.iterations;
+    let (mut done, evidence) = (0, &targets.of_fits());
+    watch.report(Stage::Propose, [0, total], None, None)?;
+    let jobs = numbers.iter().enumerate().map(|(i, &number)| {
+        // One fit is enough to look at.
+        let previewed = i == 0;
+        move |tell: &mut dyn FnMut((f64, Option<Cloud>)) -> ControlFlow<()>| match known(number) {
+            Some(known) => Ok(known.clone()),
+            None => {
+                quick_fit(evidence.clone(), &config.fit, number, |p| tell((p.loss, previewed.then(|| p.cloud.clone()))))
+            }
+        }
+    });
+    let mut stopped = Ok(());
+    let fits = side_by_side(jobs.collect(), |_, (loss, cloud)| {
+        done += 1;
+        let preview = cloud.as_ref().map(|cloud| (Preview::Fit(cloud), &scene.canonical_from_user));
+        stopped = watch.report(Stage::Propose, [done, total], Some(loss), preview);
+        flow(&stopped)
+    });
+    stopped?;
+    fits.into_iter().map(Lift::lift).collect()
+}

@@ -1,0 +1,147 @@
+//! Step 2, symmetry. In: the canonical scene with up to four photos, and an initial fit of it. Out: the targets of the
+//! steps that follow, photos and what a symmetry adds to them: mirrored photos as further views, rotated silhouettes.
+//!
+//! A symmetry is believed where a fit of photos and additions together still agrees with the photos
+//! ([`find_mirror`], [`find_axis`]; docs/research/experiments/symmetry.md). Cost: seven seconds of
+//! two cores.
+
+use std::ops::ControlFlow;
+
+use freerange_optim::{
+    Axis, Evidence, FoundAxis, FoundMirror, Mirror, Outline, axis_steps, find_axis, find_mirror, mirror_steps,
+    mirrored, turned,
+};
+use freerange_scene::camera::View;
+use freerange_util::Note;
+
+use super::{
+    CanonicalScene,
+    watch::{Watch, flow},
+};
+use crate::{Detect, Error, PipelineConfig, Stage, error::Lift};
+
+/// Photos beyond which no symmetry is looked for: so many were measured, and the network sees at most twice as many.
+const MOST_PHOTOS: usize = 4;
+
+/// What was found.
+#[derive(Default)]
+pub(crate) struct Symmetry {
+    mirror: Option<Mirror>,
+    axis: Option<Axis>,
+    notes: Vec<Note>,
+}
+
+/// What fits, the network and the optimization should agree with.
+pub(crate) struct Targets {
+    /// The network's views, and their mirror images.
+    network: Vec<View>,
+    /// How many of them are photos.
+    network_photos: usize,
+    /// All photos, and after them their mirror images.
+    views: Vec<View>,
+    /// How many of them are photos.
+    photos: usize,
+    axis: Option<Axis>,
+}
+
+/// Looks for symmetries, unless that is switched off or there are more than four photos.
+pub(crate) fn detect(
+    scene: &CanonicalScene,
+    config: &PipelineConfig,
+    watch: &mut Watch<'_>,
+) -> Result<Symmetry, Error> {
+    let (limits, fit) = (&config.symmetry, &config.propose.fit);
+    let Some(own) = scene.fit.as_ref().filter(|_| limits.detect == Detect::Auto) else {
+        return Ok(Symmetry::default());
+    };
+    if scene.photos.len() > MOST_PHOTOS {
+        let text = format!("no symmetry is looked for: there are more than {MOST_PHOTOS} photos");
+        return Ok(Symmetry { notes: vec![Note::understood(text)], ..Symmetry::default() });
+    }
+    let turning = if limits.revolution_threshold > 0.0 { axis_steps(fit) } else { 0 };
+    let mirroring = if limits.reflection_threshold > 0.0 { mirror_steps(fit) } else { 0 };
+    let total = turning + mirroring;
+    watch.report(Stage::Symmetry, [0, total], None, None)?;
+    let mut report = |done: usize, stopped: &mut Result<(), Error>| -> ControlFlow<()> {
+        *stopped = watch.report(Stage::Symmetry, [done, total], None, None);
+        flow(stopped)
+    };
+    let shown = scene.network_views();
+    let (mut axis, mut mirror, mut stopped) = (None, None, Ok(()));
+    if turning > 0 {
+        axis = find_axis(&shown, own, fit, limits.revolution_threshold, 0, |done| report(done, &mut stopped)).lift()?;
+        std::mem::replace(&mut stopped, Ok(()))?;
+    }
+    if mirroring > 0 {
+        let report = |done| report(turning + done, &mut stopped);
+        mirror = find_mirror(&shown, own, fit, limits.reflection_threshold, 0, report).lift()?;
+        stopped?;
+    }
+    watch.report(Stage::Symmetry, [total, total], None, None)?;
+    let mut found = Symmetry::default();
+    if let Some(FoundAxis { axis, contradiction }) = axis {
+        let [x, y, z] = axis.direction.to_array();
+        found.notes.push(Note::assumed(format!(
+            "the object is a solid of revolution about an axis in direction ({x:.2}, {y:.2}, {z:.2}): rotated silhouettes are \
+             further targets (residual {contradiction:.2}, at most {})",
+            limits.revolution_threshold
+        )));
+        found.axis = Some(axis);
+    }
+    if let Some(FoundMirror { mirror, doubt }) = mirror {
+        let [x, y, z] = mirror.normal.to_array();
+        found.notes.push(Note::assumed(format!(
+            "the object is symmetric about the plane with normal ({x:.2}, {y:.2}, {z:.2}): mirrored photos are further views \
+             (residual {doubt:.2}, at most {})",
+            limits.reflection_threshold
+        )));
+        found.mirror = Some(mirror);
+    }
+    Ok(found)
+}
+
+impl Symmetry {
+    /// The targets, with what the symmetry adds. They take the scene's photos; notes go to the scene; a fit of photos alone is
+    /// dropped where there is more.
+    pub fn targets(self, scene: &mut CanonicalScene) -> Targets {
+        let mut network = scene.network_views();
+        let mut views = std::mem::take(&mut scene.photos);
+        let (network_photos, photos) = (network.len(), views.len());
+        if let Some(mirror) = &self.mirror {
+            network.extend(mirrored(&network, mirror));
+            views.extend(mirrored(&views, mirror));
+        }
+        if self.mirror.is_some() || self.axis.is_some() {
+            scene.fit = None;
+        }
+        scene.notes.extend(self.notes);
+        Targets { network, network_photos, views, photos, axis: self.axis }
+    }
+}
+
+impl Targets {
+    /// What the network sees.
+    pub fn network_views(&self) -> &[View] {
+        &self.network
+    }
+
+    /// What initial fits agree with.
+    pub fn of_fits(&self) -> Evidence<'_> {
+        Evidence { views: &self.network, outlines: self.silhouettes(&self.network[..self.network_photos]) }
+    }
+
+    /// How many photos there are, without what a symmetry adds.
+    pub fn photos(&self) -> usize {
+        self.photos
+    }
+
+    /// What the optimization agrees with.
+    pub fn of_optimization(&self) -> Evidence<'_> {
+        Evidence { views: &self.views, outlines: self.silhouettes(&self.views[..self.photos]) }
+    }
+
+    /// Silhouettes of `photos` rotated about the axis, if there is one.
+    fn silhouettes<'a>(&self, photos: &'a [View]) -> Vec<Outline<'a>> {
+        self.axis.as_ref().map_or_else(Vec::new, |axis| turned(photos, axis))
+    }
+}

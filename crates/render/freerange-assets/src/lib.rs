@@ -1,0 +1,8 @@
+//! Where training objects come from: triangle meshes in ([`mesh`]), a generator of household objects ([`generate`]), and
+//! views of both ([`render`]).
+//!
+//! Architecture invariant: no Gaussians and no tensors here.
+
+pub mod generate;
+pub mod mesh;
+pub mod render;

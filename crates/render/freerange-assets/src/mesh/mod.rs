@@ -1,0 +1,18 @@
+//! Textured triangle meshes: files in ([`load_mesh`]), materials and the textures that colour them.
+//!
+//! What is drawn of a mesh is `freerange-assets`'s, where meshes come from without files `freerange-assets`'s.
+
+mod error;
+mod load;
+pub mod noise;
+mod pattern;
+mod picture;
+mod texture;
+mod triangles;
+
+pub use error::MeshError;
+pub use load::{LoadLimits, Loaded, MeshFormat, Up, load_mesh, load_mesh_bytes};
+pub use pattern::{Form, Frame, Pattern, Wear};
+pub use picture::{Map, Picture, Wrap};
+pub use texture::{AlphaMode, Material, Raster, Texture, linear_to_srgb, srgb_to_linear};
+pub use triangles::Mesh;
