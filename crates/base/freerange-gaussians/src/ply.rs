@@ -7,54 +7,23 @@
 //! of 2D Gaussians, and the compressed form of PlayCanvas. Gaussians that are not finite are left out. Headers are not
 //! trusted: memory grows with the rows that arrive.
 
-use crate::ply_columns::{Column, Plan};
+use crate::ply_columns::{COLUMNS, Column, Plan, SCALE_OF_NONE};
 use crate::ply_compressed;
-use crate::ply_header::{Element, Format, Kind, Property, Scalar, read_header};
+use crate::ply_error::{listed, property_error, value_error};
+use crate::ply_file::PlyFile;
+use crate::ply_header::{Element, read_header};
+use crate::ply_values::Values;
 use crate::{Cloud, Harmonics, RenderMode, SplatError, Splats, channel, coefficients};
 use freerange_util::{IoError, write_atomically};
 use glam::DVec3;
-use std::io::{self, BufRead, BufReader, Read, Write};
+use std::io::{self, BufRead, BufReader, Write};
 use std::{fs::File, path::Path};
 
 /// The constant real spherical harmonic, 1 / (2 sqrt(pi)).
 pub(crate) const SH_C0: f64 = 0.282_094_791_773_878_14;
 
-/// Columns of the files we write: a channel, or a zero (the normal that nobody uses).
-pub(crate) const COLUMNS: [(&str, Option<usize>); 17] = [
-    ("x", Some(0)),
-    ("y", Some(1)),
-    ("z", Some(2)),
-    ("nx", None),
-    ("ny", None),
-    ("nz", None),
-    ("f_dc_0", Some(11)),
-    ("f_dc_1", Some(12)),
-    ("f_dc_2", Some(13)),
-    ("opacity", Some(10)),
-    ("scale_0", Some(3)),
-    ("scale_1", Some(4)),
-    ("scale_2", Some(5)),
-    ("rot_0", Some(6)),
-    ("rot_1", Some(7)),
-    ("rot_2", Some(8)),
-    ("rot_3", Some(9)),
-];
-
-/// The log-scale of a standard deviation of zero, which has no logarithm.
-pub const SCALE_OF_NONE: f32 = -40.0;
 /// The logit of an opacity of 1, which has none either: that of the number of 32 bits next to it.
 const LOGIT_OF_ONE: f32 = 16.118_095;
-
-/// What a `.ply` holds.
-#[derive(Clone, Debug, PartialEq)]
-pub struct PlyFile {
-    /// The Gaussians; all channels finite.
-    pub splats: Splats,
-    /// Which way is up, where the file says so.
-    pub up: Option<DVec3>,
-    /// What was left out or looks odd, one sentence each, for the user.
-    pub notes: Vec<String>,
-}
 
 /// Reads the Gaussians of a `.ply` file.
 ///
@@ -76,7 +45,7 @@ pub fn parse_ply(mut reader: impl BufRead, file: &Path) -> Result<PlyFile, Splat
         let names: Vec<_> = header.elements.iter().map(|e| e.name.as_str()).collect();
         return Err(property_error(file, "x", "an element \"vertex\"", &format!("the elements {}", listed(&names))));
     };
-    let mut values = Values { reader, format: header.format, file, line: Vec::new(), used: 0 };
+    let mut values = Values::new(reader, header.format, file);
     if ply_compressed::is_compressed(&header.elements[at]) {
         return ply_compressed::read(values, &header, at);
     }
@@ -280,183 +249,4 @@ fn write_all(cloud: &Cloud, harmonics: &Harmonics, comments: &[String], w: &mut 
         }
     }
     Ok(())
-}
-
-/// The first few of `names`; headers may hold thousands.
-pub(crate) fn listed(names: &[&str]) -> String {
-    let shown = names.iter().take(8).map(|n| n.chars().take(40).collect()).collect::<Vec<String>>().join(", ");
-    if names.len() > 8 { format!("{shown} and {} more", names.len() - 8) } else { shown }
-}
-
-/// The values after the header, row by row.
-pub(crate) struct Values<'a, R> {
-    reader: R,
-    format: Format,
-    pub(crate) file: &'a Path,
-    /// ascii: the current line, and how much of it is used up.
-    line: Vec<u8>,
-    used: usize,
-}
-
-/// Longest line of an ascii file, in bytes.
-const LINE_LIMIT: u64 = 1 << 24;
-
-impl<R: BufRead> Values<'_, R> {
-    /// Calls `each(row, column, value)` for all single values of `element`; of lists, for their length.
-    pub(crate) fn rows(
-        &mut self,
-        element: &Element,
-        mut each: impl FnMut(u64, usize, f64) -> Result<(), SplatError>,
-    ) -> Result<(), SplatError> {
-        if element.properties.is_empty() {
-            return Ok(()); // rows of no values take no bytes, however many are claimed
-        }
-        for row in 0..element.count {
-            self.start_row(element, row)?;
-            for (column, property) in element.properties.iter().enumerate() {
-                let value = match property.kind {
-                    Kind::Single(scalar) => self.value(scalar, element, row, property)?,
-                    Kind::List(count, item) => {
-                        let length = self.value(count, element, row, property)?;
-                        if !(0.0..=f64::from(u32::MAX)).contains(&length) {
-                            let expected = "the length of a list";
-                            return Err(value_error(
-                                self.file,
-                                element,
-                                row,
-                                &property.name,
-                                expected,
-                                &length.to_string(),
-                            ));
-                        }
-                        // At most 2^32 steps, and each of them uses bytes up.
-                        for _ in 0..length as u64 {
-                            self.value(item, element, row, property)?;
-                        }
-                        length
-                    }
-                };
-                each(row, column, value)?;
-            }
-            self.end_row(element, row)?;
-        }
-        Ok(())
-    }
-
-    fn value(&mut self, scalar: Scalar, element: &Element, row: u64, property: &Property) -> Result<f64, SplatError> {
-        if self.format == Format::Ascii {
-            return self.word(scalar, element, row, property);
-        }
-        let mut bytes = [0; 8];
-        let used = &mut bytes[..scalar.bytes()];
-        if let Err(source) = self.reader.read_exact(used) {
-            return Err(match source.kind() {
-                io::ErrorKind::UnexpectedEof => {
-                    let expected = format!("{} rows", element.count);
-                    value_error(self.file, element, row, &property.name, &expected, "the end of the file")
-                }
-                _ => IoError::at(self.file)(source).into(),
-            });
-        }
-        if self.format == Format::Big {
-            used.reverse();
-        }
-        let [a, b, c, d, ..] = bytes;
-        Ok(match scalar {
-            Scalar::I8 => i8::from_le_bytes([a]).into(),
-            Scalar::U8 => a.into(),
-            Scalar::I16 => i16::from_le_bytes([a, b]).into(),
-            Scalar::U16 => u16::from_le_bytes([a, b]).into(),
-            Scalar::I32 => i32::from_le_bytes([a, b, c, d]).into(),
-            Scalar::U32 => u32::from_le_bytes([a, b, c, d]).into(),
-            Scalar::F32 => f32::from_le_bytes([a, b, c, d]).into(),
-            Scalar::F64 => f64::from_le_bytes(bytes),
-        })
-    }
-
-    /// ascii: takes the next line that is not blank.
-    fn start_row(&mut self, element: &Element, row: u64) -> Result<(), SplatError> {
-        if self.format != Format::Ascii {
-            return Ok(());
-        }
-        loop {
-            self.used = 0;
-            self.line.clear();
-            let read = self.reader.by_ref().take(LINE_LIMIT).read_until(b'\n', &mut self.line);
-            let read = read.map_err(IoError::at(self.file))?;
-            let fail = |expected: &str, found| {
-                Err(value_error(self.file, element, row, &element.properties[0].name, expected, found))
-            };
-            if read == 0 {
-                return fail(&format!("{} rows", element.count), "the end of the file");
-            }
-            if read as u64 == LINE_LIMIT {
-                return fail("a row", "a line too long");
-            }
-            if !self.line.trim_ascii().is_empty() {
-                return Ok(());
-            }
-        }
-    }
-
-    /// ascii: checks that the line is used up, since else all columns may have been taken for others.
-    fn end_row(&self, element: &Element, row: u64) -> Result<(), SplatError> {
-        let left = self.line.get(self.used..).unwrap_or_default().trim_ascii();
-        match (left.is_empty(), element.properties.last()) {
-            (false, Some(last)) => {
-                let found = quoted(left);
-                Err(value_error(self.file, element, row, &last.name, "the end of the line after it", &found))
-            }
-            _ => Ok(()),
-        }
-    }
-
-    /// ascii: the next word of the line as a number.
-    fn word(&mut self, scalar: Scalar, element: &Element, row: u64, property: &Property) -> Result<f64, SplatError> {
-        let left = self.line[self.used..].trim_ascii_start();
-        let word = left.split(u8::is_ascii_whitespace).next().unwrap_or_default();
-        self.used = self.line.len() - left.len() + word.len();
-        let text = std::str::from_utf8(word).ok();
-        // A float is rounded once, from text to f32. Whole numbers may be written with a point.
-        let number = match scalar {
-            Scalar::F32 => text.and_then(|t| t.parse::<f32>().ok()).map(f64::from),
-            _ => text.and_then(|t| t.parse::<f64>().ok()),
-        };
-        number.ok_or_else(|| {
-            let found = if word.is_empty() { "the end of the line".into() } else { quoted(word) };
-            value_error(self.file, element, row, &property.name, &format!("a number ({})", scalar.name()), &found)
-        })
-    }
-}
-
-/// The start of what a file holds, for messages.
-fn quoted(bytes: &[u8]) -> String {
-    format!("{:?}", String::from_utf8_lossy(&bytes[..bytes.len().min(40)]))
-}
-
-pub(crate) fn property_error(file: &Path, property: &str, expected: &str, found: &str) -> SplatError {
-    SplatError::PlyProperty {
-        file: file.into(),
-        property: property.into(),
-        expected: expected.into(),
-        found: found.into(),
-    }
-}
-
-pub(crate) fn value_error(
-    file: &Path,
-    element: &Element,
-    row: u64,
-    property: &str,
-    expected: &str,
-    found: &str,
-) -> SplatError {
-    SplatError::PlyValue {
-        file: file.into(),
-        element: element.name.as_str().into(),
-        row,
-        property: property.into(),
-        expected: expected.into(),
-        found: found.into(),
-    }
 }

@@ -1,11 +1,35 @@
-//! What the properties of a `.ply`'s Gaussians are.
+//! What the properties of a `.ply`'s Gaussians are, in files that we write and in those that we read.
 
 use std::path::Path;
 
 use crate::cloud::Row;
-use crate::ply::{COLUMNS, SCALE_OF_NONE, listed, property_error};
+use crate::ply_error::{listed, property_error};
 use crate::ply_header::{Element, Header, Kind, Scalar};
 use crate::{MAX_DEGREE, RenderMode, SplatError, channel, coefficients};
+
+/// Columns of the files we write: a channel, or a zero (the normal that nobody uses).
+pub(crate) const COLUMNS: [(&str, Option<usize>); 17] = [
+    ("x", Some(0)),
+    ("y", Some(1)),
+    ("z", Some(2)),
+    ("nx", None),
+    ("ny", None),
+    ("nz", None),
+    ("f_dc_0", Some(11)),
+    ("f_dc_1", Some(12)),
+    ("f_dc_2", Some(13)),
+    ("opacity", Some(10)),
+    ("scale_0", Some(3)),
+    ("scale_1", Some(4)),
+    ("scale_2", Some(5)),
+    ("rot_0", Some(6)),
+    ("rot_1", Some(7)),
+    ("rot_2", Some(8)),
+    ("rot_3", Some(9)),
+];
+
+/// The log-scale of a standard deviation of zero, which has no logarithm.
+pub const SCALE_OF_NONE: f32 = -40.0;
 
 /// The properties that each channel is stored in, but for colors.
 const PROPERTIES: [&str; 11] =

@@ -6,9 +6,11 @@
 //! each. The element `sh`, if there is one, has further harmonics, channel by channel, in a byte each.
 
 use crate::cloud::Row;
-use crate::ply::{PlyFile, Values, property_error, value_error};
 use crate::ply_columns::{rest_count, rest_number};
+use crate::ply_error::{property_error, value_error};
+use crate::ply_file::PlyFile;
 use crate::ply_header::{Element, Header, Kind, Scalar};
+use crate::ply_values::Values;
 use crate::{Cloud, Harmonics, MAX_DEGREE, SplatError, Splats, channel, coefficients};
 use std::{io::BufRead, path::Path};
 

@@ -8,10 +8,12 @@
 #![deny(missing_docs)]
 
 pub mod camera;
+mod decode;
 mod error;
 pub mod estimate;
 pub mod inspect;
 mod load;
+mod mask_model;
 #[cfg(feature = "mask-model")]
 mod network;
 mod open;
@@ -20,6 +22,7 @@ mod write;
 
 pub use error::SceneError;
 pub use freerange_util::{Note, NoteKind};
-pub use load::{LoadConfig, Loaded, MaskKind, MaskModel, MaskSource, PixelRange, cut, files, load, up_of, write_masks};
+pub use load::{LoadConfig, Loaded, MaskKind, MaskSource, cut, files, load, up_of, write_masks};
+pub use mask_model::{MaskModel, PixelRange};
 pub use open::{Scene, SceneConfig, views_to_compare};
 pub use write::write_colmap;

@@ -4,7 +4,7 @@ use crate::camera::{View, image_ops::resize_area};
 use crate::{
     SceneError,
     error::In,
-    load::{MaskModel, PixelRange},
+    mask_model::{MaskModel, PixelRange},
     read::bytes_of,
 };
 use image::{Rgba, RgbaImage};

@@ -2,12 +2,12 @@
 
 use super::{
     LoadConfig, MaskSource,
-    masks::{coverage, read_mask},
-    picture::decode,
+    mask_image::{coverage, read_mask},
 };
 use crate::camera::{Camera, Lens, nearest_point};
 use crate::{
     SceneError,
+    decode::{decode, size_of},
     error::In,
     read::{Cameras, Photo},
 };
@@ -115,7 +115,7 @@ fn outline(
     mask: Option<&Path>,
     config: &LoadConfig,
 ) -> Result<Option<(DVec3, Option<f64>)>, SceneError> {
-    let size = super::size_of(&photo.image)?;
+    let size = size_of(&photo.image)?;
     let share = match (mask, &config.masks) {
         (Some(mask), _) => read_mask(mask, size, config.invert_masks)?,
         (None, MaskSource::Auto | MaskSource::Alpha) => {

@@ -1,10 +1,11 @@
 //! Views without what is around the object: by mask files, alpha, a plain backdrop, a network, or poses and colors.
 
-use super::{LoadConfig, MaskKind, MaskModel, MaskSource};
+use super::{LoadConfig, MaskKind, MaskSource};
 use crate::camera::{View, scene::cut_out};
 use crate::{
     SceneError,
     estimate::{self, Estimate, Hints},
+    mask_model::MaskModel,
 };
 use freerange_util::{Invalid, Note};
 use image::{GrayImage, Rgba, RgbaImage};

@@ -1,12 +1,8 @@
 //! Mask files: which belong to which photo, and whether they can be what they are taken for.
 
-use super::{
-    LoadConfig, MaskSource,
-    picture::{Decoded, Picture, decode},
-};
+use super::{LoadConfig, MaskSource, picture::Picture};
 use crate::camera::{
     CANONICAL_RADIUS, FrameConfig, View, canonical_from_user,
-    image_ops::resize_area,
     scene::{ImageFiles, Located},
 };
 use crate::{
@@ -17,7 +13,6 @@ use crate::{
 };
 use freerange_util::Note;
 use glam::DVec3;
-use image::{GrayImage, Luma, RgbaImage};
 use std::{
     collections::{BTreeSet, HashMap},
     path::{Path, PathBuf},
@@ -168,42 +163,6 @@ fn all_or_none(photos: &[Photo], masks: &[Option<PathBuf>], needed: bool) -> Res
     }
 }
 
-/// A mask file for an image of `size`: the object's share of each pixel. That is brightness; the alpha of an image that has some and is not
-/// white where it is opaque (the photo, cut out); and of an image with no more than one value besides 0, that value.
-pub(super) fn read_mask(path: &Path, size: (u32, u32), invert: bool) -> Result<GrayImage, SceneError> {
-    let Decoded { image, .. } = decode(path)?;
-    let found = image.dimensions();
-    let (a, b) = (u64::from(found.0) * u64::from(size.1), u64::from(found.1) * u64::from(size.0));
-    if a.abs_diff(b) > u64::from(size.0.max(size.1)) {
-        return Err(SceneError::Size { file: path.into(), of: "its photo's", expected: size, found });
-    }
-    let mut shares = shares(&image);
-    // Labels: 0 and 1, for instance.
-    let label = shares.pixels().map(|p| p[0]).max().filter(|v| (1..128).contains(v));
-    if let Some(label) = label
-        && shares.pixels().all(|p| p[0] == 0 || p[0] == label)
-    {
-        shares.pixels_mut().for_each(|p| p[0] = if p[0] == 0 { 0 } else { 255 });
-    }
-    if invert {
-        shares.pixels_mut().for_each(|p| p[0] = 255 - p[0]);
-    }
-    if found == size {
-        return Ok(shares);
-    }
-    Ok(super::picture::gray(&resize_area(&super::picture::coloured(&shares), size.0, size.1)))
-}
-
-fn shares(image: &RgbaImage) -> GrayImage {
-    let bright = |p: &[u8; 4]| (u32::from(p[0]) + u32::from(p[1]) + u32::from(p[2])) / 3;
-    let clear = image.pixels().any(|p| p[3] < 128);
-    let cut_out = clear && image.pixels().any(|p| p[3] >= 250 && bright(&p.0) < 250);
-    GrayImage::from_fn(image.width(), image.height(), |x, y| {
-        let p = image.get_pixel(x, y).0;
-        Luma([if cut_out { p[3] } else { (bright(&p) * u32::from(p[3]) / 255) as u8 }])
-    })
-}
-
 /// What mask files mean, going by how they look.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Meaning {
@@ -213,16 +172,6 @@ pub(super) enum Meaning {
     Inverted,
     /// White is what may be looked at, as nerfstudio and COLMAP have it: almost all of the photos.
     Usable,
-}
-
-/// How much of an image's border, and of all of it, a mask covers.
-pub(super) fn coverage(mask: &GrayImage) -> (f64, f64) {
-    let (w, h) = mask.dimensions();
-    let white = |p: &Luma<u8>| usize::from(p[0] >= 128);
-    let all: usize = mask.pixels().map(white).sum();
-    let border = mask.enumerate_pixels().filter(|(x, y, _)| *x == 0 || *y == 0 || *x == w - 1 || *y == h - 1);
-    let (count, along) = border.fold((0, 0), |(count, along), (.., p)| (count + 1, along + white(p)));
-    (along as f64 / f64::from(count.max(1)), all as f64 / (f64::from(w) * f64::from(h)))
 }
 
 /// What the masks of `pictures` mean.

@@ -3,19 +3,19 @@
 use super::{
     LoadConfig, MaskSource,
     aim::Aim,
-    masks::{coverage, read_mask},
+    cut::set_alpha,
+    mask_image::{coloured, coverage, gray, read_mask},
 };
 use crate::camera::{Camera, Lens, image_ops::resize_area};
 use crate::{
     SceneError,
+    decode::{Decoded, decode},
     error::In,
-    read::{Intrinsics, LARGEST_SIDE, Photo},
+    read::{Intrinsics, Photo},
 };
-use image::{DynamicImage, GrayImage, ImageDecoder, ImageReader, Luma, Rgba, RgbaImage, metadata::Orientation};
+use image::{DynamicImage, GrayImage, RgbaImage, metadata::Orientation};
 use std::path::Path;
 
-/// What one decoder may allocate, in bytes.
-const LARGEST_DECODE: u64 = 2 << 30;
 /// Transparency of less than this share of an image is an accident, not a mask.
 const SPECKS: f64 = 0.002;
 
@@ -41,7 +41,7 @@ impl Picture {
     /// Its mask says what may be looked at: the rest is as what the lens does not show.
     pub fn only_usable(&mut self) {
         if let Some(mask) = self.mask.take() {
-            super::set_alpha(&mut self.image, mask.as_raw());
+            set_alpha(&mut self.image, mask.as_raw());
         }
     }
 }
@@ -102,104 +102,4 @@ pub(super) fn picture(
         camera = camera.resized(w, h);
     }
     Ok(Picture { image, camera, mask, mask_covers, alpha, size, turned, aimed, converted })
-}
-
-/// An image as it is stored.
-pub(super) struct Decoded {
-    /// In sRGB.
-    pub image: RgbaImage,
-    /// How its EXIF data says to turn it.
-    pub orientation: Orientation,
-    /// Whether its colors were others than sRGB's.
-    pub converted: bool,
-}
-
-/// Decodes a file.
-pub(super) fn decode(path: &Path) -> Result<Decoded, SceneError> {
-    let failed = |e| SceneError::Image { file: path.into(), source: Box::new(e) };
-    let mut limits = image::Limits::default();
-    limits.max_image_width = Some(LARGEST_SIDE);
-    limits.max_image_height = Some(LARGEST_SIDE);
-    limits.max_alloc = Some(LARGEST_DECODE);
-    let mut reader =
-        ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(|e| In(path).read(e))?;
-    reader.limits(limits);
-    if let Some(kind) = kind_of(path) {
-        return Err(In(path).unreadable(kind));
-    }
-    let mut decoder = reader.into_decoder().map_err(failed)?;
-    let orientation = decoder.orientation().map_err(failed)?;
-    // What cannot be read of a profile changes no color.
-    let profile = decoder.icc_profile().ok().flatten();
-    let mut image = DynamicImage::from_decoder(decoder).map_err(failed)?.into_rgba8();
-    let converted = profile.is_some_and(|profile| to_srgb(&mut image, &profile));
-    Ok(Decoded { image, orientation, converted })
-}
-
-/// The kind of an image that is not decoded, by the file's first bytes: cameras and messengers rename files.
-fn kind_of(path: &Path) -> Option<&'static str> {
-    let mut start = [0; 16];
-    std::io::Read::read_exact(&mut std::fs::File::open(path).ok()?, &mut start).ok()?;
-    match (&start[..4], &start[4..8], &start[8..12]) {
-        (_, b"ftyp", b"avif" | b"avis") => Some("AVIF"),
-        (_, b"ftyp", b"heic" | b"heix" | b"hevc" | b"heim" | b"heis" | b"mif1" | b"msf1") => Some("HEIC"),
-        (b"II*\0" | b"MM\0*", ..) => Some("TIFF"),
-        (b"v/1\x01", ..) => Some("OpenEXR"),
-        _ => None,
-    }
-}
-
-/// Colors that differ from sRGB's by no more than this are left as they are, in 8-bit steps.
-const SAME_COLOR: u8 = 2;
-
-/// Turns an image with this ICC profile into sRGB; whether anything changed. Profiles other than of red, green and blue are passed over.
-fn to_srgb(image: &mut RgbaImage, profile: &[u8]) -> bool {
-    let Ok(own) = moxcms::ColorProfile::new_from_slice(profile) else { return false };
-    let (layout, options) = (moxcms::Layout::Rgba, moxcms::TransformOptions::default());
-    if own.color_space != moxcms::DataColorSpace::Rgb {
-        return false;
-    }
-    let Ok(transform) = own.create_transform_8bit(layout, &moxcms::ColorProfile::new_srgb(), layout, options) else {
-        return false;
-    };
-    let probes: Vec<u8> = (0..27u32)
-        .flat_map(|i| [i % 3, i / 3 % 3, i / 9].map(|v| 40 + 85 * v as u8).into_iter().chain([255]))
-        .collect();
-    let mut shown = vec![0; probes.len()];
-    let same = transform.transform(&probes, &mut shown).is_err()
-        || probes.iter().zip(&shown).all(|(a, b)| a.abs_diff(*b) <= SAME_COLOR);
-    if same {
-        return false;
-    }
-    // Row by row: no second image.
-    let width = 4 * image.width() as usize;
-    let mut row = vec![0; width];
-    for pixels in image.chunks_exact_mut(width.max(4)) {
-        if transform.transform(pixels, &mut row).is_err() {
-            return false;
-        }
-        pixels.copy_from_slice(&row);
-    }
-    true
-}
-
-/// Width and height of an image file, from its beginning.
-pub(crate) fn size_of(path: &Path) -> Result<(u32, u32), SceneError> {
-    let failed = |e| SceneError::Image { file: path.into(), source: Box::new(e) };
-    if let Some(kind) = kind_of(path) {
-        return Err(In(path).unreadable(kind));
-    }
-    let reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(|e| In(path).read(e))?;
-    reader.into_dimensions().map_err(failed)
-}
-
-pub(super) fn coloured(mask: &GrayImage) -> RgbaImage {
-    RgbaImage::from_fn(mask.width(), mask.height(), |x, y| {
-        let v = mask.get_pixel(x, y)[0];
-        Rgba([v, v, v, 255])
-    })
-}
-
-pub(super) fn gray(image: &RgbaImage) -> GrayImage {
-    GrayImage::from_fn(image.width(), image.height(), |x, y| Luma([image.get_pixel(x, y)[0]]))
 }

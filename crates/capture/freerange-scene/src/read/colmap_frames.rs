@@ -3,7 +3,7 @@
 
 use super::{
     bytes_of,
-    colmap::{Bytes, ColmapImage, number},
+    colmap_values::{Bytes, ColmapImage, number},
     text_of,
 };
 use crate::SceneError;

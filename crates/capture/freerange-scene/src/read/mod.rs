@@ -3,8 +3,11 @@
 //! Every reader takes bytes that nobody has checked. Counts claimed by a file are believed only as far as the bytes go that are
 //! really there, and what cannot be used is refused with file, place and field.
 
+mod checked;
 pub mod colmap;
 pub mod colmap_frames;
+mod colmap_values;
+mod files;
 pub mod metashape;
 pub mod opf;
 mod origin;
@@ -16,24 +19,22 @@ pub mod turntable;
 
 use crate::camera::{
     Camera, Lens,
-    scene::{IMAGE_EXTENSIONS, LARGEST_COORDINATE, nearest_rotation, unreadable_kind},
+    scene::{IMAGE_EXTENSIONS, unreadable_kind},
 };
 use crate::{SceneError, error::In};
+pub(crate) use checked::{coefficients, pinhole, rigid, world_to_camera};
+use files::start_of;
+pub(crate) use files::{bytes_of, entries, has_extension, inside, text_of};
 use freerange_util::{Invalid, Note};
-use glam::{DMat3, DMat4, DVec3};
+use glam::{DMat4, DVec3};
 use photos::Photos;
 pub(crate) use photos::listed;
 use std::{
     collections::{BTreeSet, HashMap},
-    io::Read,
     path::{Path, PathBuf},
 };
 pub use turntable::{Turntable, in_order, photos_in};
 
-/// Largest image side accepted, in pixels.
-pub(crate) const LARGEST_SIDE: u32 = 16384;
-/// Largest file of cameras accepted, in bytes: COLMAP's with all keypoints of thousands of photos.
-const LARGEST_FILE: u64 = 1 << 30;
 /// Photos of one scene, at most.
 pub(crate) const LARGEST_SCENE: usize = 10_000;
 /// Image files that are taken without being named.
@@ -391,123 +392,4 @@ fn nothing(folder: &Path, format: Option<Format>) -> Result<SceneError, SceneErr
         }
         None => SceneError::Nothing { folder: folder.into(), found },
     })
-}
-
-/// What a folder holds, sorted by name.
-pub(crate) fn entries(folder: &Path) -> Result<Vec<PathBuf>, SceneError> {
-    let failed = |e| In(folder).read(e);
-    let mut found = Vec::new();
-    for entry in std::fs::read_dir(folder).map_err(failed)?.take(100_000) {
-        found.push(entry.map_err(failed)?.path());
-    }
-    found.sort();
-    Ok(found)
-}
-
-pub(crate) fn has_extension(path: &Path, extensions: &[&str]) -> bool {
-    path.extension().is_some_and(|e| extensions.iter().any(|known| e.eq_ignore_ascii_case(known)))
-}
-
-/// A whole file, if it is of a size that such files have.
-pub(crate) fn bytes_of(file: &Path) -> Result<Vec<u8>, SceneError> {
-    read_up_to(file, LARGEST_FILE + 1).and_then(|bytes| {
-        let found = bytes.len() as u64;
-        match found > LARGEST_FILE {
-            true => Err(SceneError::TooLarge { file: file.into(), limit: LARGEST_FILE, found }),
-            false => Ok(bytes),
-        }
-    })
-}
-
-fn start_of(file: &Path) -> Result<Vec<u8>, SceneError> {
-    read_up_to(file, 4096)
-}
-
-fn read_up_to(file: &Path, limit: u64) -> Result<Vec<u8>, SceneError> {
-    let failed = |e| In(file).read(e);
-    // A pipe or device would never end.
-    if !std::fs::metadata(file).map_err(failed)?.is_file() {
-        return Err(failed(std::io::Error::other("not a regular file")));
-    }
-    let mut bytes = Vec::new();
-    std::fs::File::open(file).and_then(|f| f.take(limit).read_to_end(&mut bytes)).map_err(failed)?;
-    Ok(bytes)
-}
-
-/// A file's text; the place of the first byte that is not UTF-8 is an error.
-pub(crate) fn text_of<'a>(file: &Path, bytes: &'a [u8]) -> Result<&'a str, SceneError> {
-    let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
-    std::str::from_utf8(bytes).map_err(|e| In(file).malformed(&format!("byte {}", e.valid_up_to()), "not UTF-8 text"))
-}
-
-/// Joins a path that a file names to a folder, if it stays inside: names are other people's.
-pub(crate) fn inside(folder: &Path, name: &str) -> Option<PathBuf> {
-    let name = name.replace('\\', "/");
-    let relative = Path::new(&name);
-    let normal = |c| matches!(c, std::path::Component::Normal(_) | std::path::Component::CurDir);
-    (!name.is_empty() && !name.contains('\0') && relative.components().all(normal)).then(|| folder.join(relative))
-}
-
-/// A camera in pixels, its numbers checked. `size` is width and height, `focal` and `principal` x and y.
-pub(crate) fn pinhole(
-    file: &Path,
-    place: &str,
-    size: (u64, u64),
-    focal: [f64; 2],
-    principal: [f64; 2],
-    world_to_camera: DMat4,
-) -> Result<Camera, SceneError> {
-    let side = |name: &str, v: u64| match v {
-        1..=16384 => Ok(v as u32),
-        _ => Err(In(file).field(place, name, &format!("a whole number from 1 to {LARGEST_SIDE}"), v)),
-    };
-    let (width, height) = (side("width", size.0)?, side("height", size.1)?);
-    for (i, (name, side)) in [("focal length", width), ("focal length", height)].into_iter().enumerate() {
-        let side = f64::from(side);
-        if !(1e-2 * side..=1e3 * side).contains(&focal[i]) {
-            let expected = format!("between 0.01 and 1000 times the image's {side} pixels");
-            return Err(In(file).field(place, name, &expected, focal[i]));
-        }
-        if !(-side..=2.0 * side).contains(&principal[i]) {
-            let expected = format!("a point near the image's {side} pixels");
-            return Err(In(file).field(place, ["cx", "cy"][i], &expected, principal[i]));
-        }
-    }
-    Ok(Camera { width, height, fx: focal[0], fy: focal[1], cx: principal[0], cy: principal[1], world_to_camera })
-}
-
-/// World to camera from the camera's axes (columns: right, down, forward, in world coordinates) and its centre.
-pub(crate) fn world_to_camera(file: &Path, place: &str, axes: DMat3, centre: DVec3) -> Result<DMat4, SceneError> {
-    let rotation = nearest_rotation(axes)
-        .map_err(|found| In(file).field(place, "rotation", "a rotation matrix", found))?
-        .transpose();
-    rigid(file, place, rotation, -(rotation * centre), centre)
-}
-
-/// World to camera from its rotation and translation; `centre` is the camera's.
-pub(crate) fn rigid(
-    file: &Path,
-    place: &str,
-    rotation: DMat3,
-    translation: DVec3,
-    centre: DVec3,
-) -> Result<DMat4, SceneError> {
-    if !(centre.abs().max_element() <= LARGEST_COORDINATE && translation.is_finite()) {
-        let expected = format!("a camera within {LARGEST_COORDINATE} of the origin");
-        return Err(In(file).field(place, "position", &expected, centre));
-    }
-    Ok(DMat4::from_cols(
-        rotation.x_axis.extend(0.0),
-        rotation.y_axis.extend(0.0),
-        rotation.z_axis.extend(0.0),
-        translation.extend(1.0),
-    ))
-}
-
-/// Distortion coefficients that a lens can have; those far beyond are errors of reading.
-pub(crate) fn coefficients(file: &Path, place: &str, names: &[&str], values: &[f64]) -> Result<(), SceneError> {
-    match names.iter().zip(values).find(|(_, v)| v.is_nan() || v.abs() > 100.0) {
-        Some((name, v)) => Err(In(file).field(place, name, "a distortion coefficient between -100 and 100", v)),
-        None => Ok(()),
-    }
 }

@@ -5,7 +5,7 @@
 
 use super::{Cameras, Format, Photo, Photos, bytes_of, coefficients, pinhole, world_to_camera};
 use crate::camera::Lens;
-use crate::{SceneError, error::In, load::size_of, read::Intrinsics};
+use crate::{SceneError, decode::size_of, error::In, read::Intrinsics};
 use freerange_util::Note;
 use glam::{DMat3, DVec3};
 use serde_json::Value;

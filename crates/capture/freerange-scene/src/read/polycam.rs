@@ -5,7 +5,7 @@
 
 use super::{Cameras, Format, Intrinsics, Photo, Photos, bytes_of, entries, has_extension, pinhole, world_to_camera};
 use crate::camera::{Camera, Lens};
-use crate::{SceneError, error::In, load::size_of};
+use crate::{SceneError, decode::size_of, error::In};
 use freerange_util::Note;
 use glam::{DMat3, DVec3};
 use serde_json::{Map, Value};

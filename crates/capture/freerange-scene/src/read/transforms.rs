@@ -2,7 +2,7 @@
 
 use super::{Cameras, Format, Intrinsics, Photo, Photos};
 use crate::camera::scene::{Description, Found, FrameDescription};
-use crate::{SceneError, load::size_of};
+use crate::{SceneError, decode::size_of};
 use freerange_util::Note;
 use std::path::{Path, PathBuf};
 

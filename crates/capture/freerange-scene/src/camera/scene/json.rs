@@ -1,6 +1,9 @@
 //! Reading `transforms*.json`: every field checked, with its frame and name in the error.
 
-use super::{files, pose};
+use super::{
+    locate::{LARGEST_SIDE, name_of},
+    pose,
+};
 use crate::camera::{Camera, CameraError, Lens, error::Place};
 use freerange_util::IoError;
 use glam::DMat4;
@@ -13,8 +16,6 @@ use std::{
 
 /// Largest scene description accepted; some ten thousand frames.
 const LARGEST_FILE: u64 = 16 << 20;
-/// Largest image side accepted, in pixels.
-pub(super) const LARGEST_SIDE: u32 = 16384;
 /// Camera models that are a pinhole with at most the distortion that [`Lens`] describes.
 const PINHOLES: [&str; 6] = ["PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"];
 /// OpenCV's fisheye model, as nerfstudio and COLMAP call it.
@@ -164,7 +165,7 @@ impl FrameDescription {
             other => return Err(field(&place, "mask_path", "a file name", found(other))),
         };
         let image = folder.join(&written);
-        let name = files::name_of(&image);
+        let name = name_of(&image);
         if name.is_empty() {
             return Err(field(&place, "file_path", "a file name", format!("{written:?}")));
         }

@@ -7,12 +7,14 @@
 mod cutout;
 mod files;
 mod json;
+mod locate;
 mod pose;
 mod write;
 
 pub use cutout::{BACKGROUND_TOLERANCE, cut_out, fills_frame};
-pub use files::{CONVERT, IMAGE_EXTENSIONS, ImageFiles, Located, image_size, unreadable_kind};
+pub use files::image_size;
 pub use json::{Description, FrameDescription};
+pub use locate::{CONVERT, IMAGE_EXTENSIONS, ImageFiles, Located, unreadable_kind};
 pub use pose::{LARGEST_COORDINATE, nearest_rotation};
 pub use write::transforms_json;
 
