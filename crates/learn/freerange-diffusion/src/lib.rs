@@ -13,5 +13,6 @@ pub mod photometric;
 mod place;
 pub mod sample;
 pub mod settings;
+pub mod targets;
 
 pub use error::FlowError;

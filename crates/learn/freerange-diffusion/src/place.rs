@@ -10,7 +10,7 @@ use freerange_scene::camera::Camera;
 use glam::DVec3;
 use rayon::prelude::*;
 
-use crate::{FlowError, photometric::Targets};
+use crate::{FlowError, targets::Targets};
 
 /// One unit of distances; the object's sphere has radius 0.5.
 const UNIT: f32 = 0.1;
@@ -226,7 +226,7 @@ fn outline(photo: &[[f32; 4]], w: usize, h: usize) -> Vec<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::photometric::Images;
+    use crate::targets::Images;
     use burn::tensor::Device;
     use freerange_scene::camera::View;
     use image::{Rgba, RgbaImage};

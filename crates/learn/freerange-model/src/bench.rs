@@ -8,6 +8,7 @@ use rand::Rng;
 
 use crate::{
     Compute, ModelConfig, ModelError,
+    compute::is_cpu,
     dit::{self, Parts},
     layers::{Builder, RandomSource},
     ops,
@@ -82,7 +83,7 @@ impl Block {
         match way {
             Way::Burn => ops::reference::attention(qkv, q, k, self.heads, tokens),
             Way::Fused | Way::Recomputed | Way::Separate => {
-                let qkv = if ops::is_cpu(&qkv.device()) { qkv } else { ops::activation(qkv, self.compute) };
+                let qkv = if is_cpu(&qkv.device()) { qkv } else { ops::activation(qkv, self.compute) };
                 ops::attention(qkv, q, k, self.heads, tokens, self.compute)
             }
         }

@@ -10,10 +10,11 @@ use burn::{
 
 use crate::{
     ModelConfig, ModelError,
+    compute::Compute,
     config::{CHANNELS, ModelKind, PLACE},
     kernels::block::BlockSettings,
     layers::{Builder, Init, Linear, NormWeight, Source},
-    ops::{self, Compute},
+    ops,
 };
 
 /// The diffusion transformer.

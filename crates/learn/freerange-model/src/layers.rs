@@ -9,7 +9,7 @@ use burn::{
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal, Uniform};
 
-use crate::{ModelError, ops, ops::Compute};
+use crate::{ModelError, compute::Compute, ops};
 
 /// Where the values of a new module come from: random numbers, or a file.
 pub(crate) trait Source {

@@ -7,6 +7,7 @@
 
 pub mod bench;
 mod checkpoint;
+mod compute;
 mod config;
 mod dit;
 mod encoder;
@@ -24,6 +25,7 @@ mod tests;
 mod weights;
 
 pub use checkpoint::{Checkpoint, Header, Precision};
+pub use compute::Compute;
 pub use config::{
     CHANNELS, Dinov2Config, EncoderConfig, ModelConfig, ModelKind, OBSERVATION, PLACE, PLUCKER, PatchConfig,
     VolumeConfig,
@@ -35,4 +37,3 @@ pub use info::{Execution, ModelInfo, PartInfo, TensorInfo, Workload, dinov2_para
 pub use layers::{Linear, NormWeight};
 pub use memory::keep_freed_memory;
 pub use model::{FreeRange, Parameter};
-pub use ops::Compute;

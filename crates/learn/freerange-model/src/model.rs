@@ -8,9 +8,9 @@ use rand::Rng;
 
 use crate::{
     Dinov2, Dit, EncoderConfig, Feedback, ImageEncoder, ModelConfig, ModelError, ModelKind,
+    compute::Compute,
     layers::{Builder, RandomSource, Source},
     one_pass::Decoder,
-    ops::Compute,
 };
 
 /// Image encoder and transformer.

@@ -25,7 +25,7 @@ use crate::{
 use freerange_diffusion::{
     conditioning::{Conditioning, shrink},
     path::{cosine_time, render_weight},
-    photometric::{Images, Targets},
+    targets::{Images, Targets},
 };
 
 /// A colour for what lies behind the object.

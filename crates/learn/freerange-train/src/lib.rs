@@ -8,6 +8,7 @@ pub mod batch;
 pub mod config;
 mod error;
 pub mod events;
+mod flat;
 mod inherit;
 pub mod log;
 mod optimizer;
@@ -18,6 +19,7 @@ pub mod trainer;
 mod validation;
 mod weights;
 
+pub use config::ValidationConfig;
 pub use error::TrainError;
-pub use validation::{Figures, ValidationConfig};
+pub use validation::Figures;
 pub use weights::average;

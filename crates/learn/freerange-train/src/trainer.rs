@@ -1,5 +1,6 @@
 //! The training loop: objects in, checkpoints out, resumable at every saved state as if never stopped.
 
+mod among;
 mod encoder;
 mod folder;
 mod lanes;
@@ -17,11 +18,11 @@ use burn::{module::Module, tensor::Device};
 use freerange_gaussians::channel;
 use freerange_model::{Checkpoint, Compute, Dinov2, FreeRange, ModelConfig};
 
-use self::{lanes::Lane, state::Progress};
 pub use self::{
-    open::{Among, Initial},
+    among::{Among, Initial},
     report::{Best, StepReport, Validated},
 };
+use self::{lanes::Lane, state::Progress};
 use crate::{
     TrainError,
     batch::Batch,

@@ -29,22 +29,6 @@ use freerange_diffusion::{
     sample::{Estimate, FlowConfig, FlowSampler, Refiner, RefinerConfig},
 };
 
-/// Measuring while training.
-#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct ValidationConfig {
-    /// Steps between two measurements; 0: none.
-    pub every: u64,
-    /// Number of objects: of the shards' validation split, or generated from seeds of their own.
-    pub objects: usize,
-}
-
-impl Default for ValidationConfig {
-    fn default() -> Self {
-        Self { every: 0, objects: 8 }
-    }
-}
-
 /// What was measured.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
 pub struct Figures {

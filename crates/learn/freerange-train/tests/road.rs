@@ -7,8 +7,9 @@ use freerange_data::ObjectSource;
 use freerange_data::build::{Generated, MakingConfig};
 use freerange_diffusion::{
     FlowError,
-    photometric::{Photometric, Targets},
+    photometric::Photometric,
     sample::{Estimate, FlowConfig, FlowSampler, Refiner, RefinerConfig},
+    targets::Targets,
 };
 use freerange_gaussians::{Cloud, Normalization, channel};
 use freerange_model::Checkpoint;

@@ -7,8 +7,9 @@ use freerange_data::build::{GaussianSource, generate_object};
 use freerange_diffusion::{
     conditioning::Conditioning,
     conditioning::shrink,
-    photometric::{Images, Photometric},
+    photometric::Photometric,
     sample::{FlowConfig, FlowSampler},
+    targets::Images,
 };
 use freerange_gaussians::Statistics;
 use freerange_model::{Checkpoint, Compute, EncoderConfig, Execution, FreeRange, ModelConfig, ModelInfo, Workload};

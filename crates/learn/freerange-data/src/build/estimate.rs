@@ -1,8 +1,9 @@
 //! What many objects will cost, from a few that are made.
 
-use crate::build::folder::{BuildOptions, Done, build};
+use crate::build::folder::{BuildOptions, build};
 use crate::build::items::Items;
-use crate::build::object::Seconds;
+use crate::build::photographed::Seconds;
+use crate::build::work::Done;
 use crate::build::{BuildConfig, BuildError};
 use crate::{HeldOutPsnr, Store};
 use freerange_util::{Invalid, IoError};

@@ -7,7 +7,7 @@ use freerange_optim::{FitConfig, Rates, fit};
 use freerange_scene::camera::View;
 use rand::Rng;
 
-use crate::build::object::Photographed;
+use crate::build::photographed::Photographed;
 use crate::build::{BuildError, ObjectConfig, SurfaceConfig, surface_gaussians};
 
 /// Standard deviation along the surface of the Gaussians that a fit starts from, in units of the square root of the area
@@ -72,7 +72,7 @@ const POLISH_RATES: Rates = Rates { mean: 3e-3, scale: 1e-2, rotation: 1e-3, opa
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::build::object::Seconds;
+    use crate::build::photographed::Seconds;
     use crate::build::tests::tiny_config;
     use freerange_gaussians::LodTree;
     use freerange_optim::psnr_over_white;

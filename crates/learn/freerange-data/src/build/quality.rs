@@ -7,9 +7,9 @@ use freerange_optim::{FitConfig, psnr_over_white};
 use freerange_util::check;
 
 use crate::build::fitted::{fitted_gaussians, polished};
-use crate::build::folder::{mesh_of, seed_of};
+use crate::build::item_object::{mesh_of, seed_of};
 use crate::build::items::Item;
-use crate::build::object::{Photographed, Seconds, add_elapsed};
+use crate::build::photographed::{Photographed, Seconds, add_elapsed};
 use crate::build::{BuildConfig, BuildError, ObjectConfig, SurfaceConfig, surface_gaussians};
 
 /// How well Gaussians show an object: PSNR in dB over held-out views, over white.

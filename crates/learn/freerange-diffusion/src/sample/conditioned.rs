@@ -6,12 +6,7 @@ use freerange_model::{Checkpoint, Compute, Feedback, FreeRange, ModelConfig};
 use freerange_scene::camera::View;
 use freerange_util::Invalid;
 
-use crate::{
-    FlowError,
-    conditioning::Conditioning,
-    conditioning::squares,
-    photometric::{Images, Photometric},
-};
+use crate::{FlowError, conditioning::Conditioning, conditioning::squares, photometric::Photometric, targets::Images};
 
 /// The network, conditioned on the views of some objects. `b` is the number of objects times that of sets of each.
 pub(super) struct Conditioned<'a> {

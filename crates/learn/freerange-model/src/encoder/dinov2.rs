@@ -16,8 +16,9 @@ use freerange_util::sha256;
 use super::bicubic;
 use crate::{
     Dinov2Config, ModelError,
+    compute::{self, Compute},
     layers::{Builder, Init, Linear, Source},
-    ops::{self, Compute},
+    ops,
     weights::{TensorFile, read_bounded},
 };
 
@@ -123,7 +124,7 @@ impl Dinov2 {
 
     /// In which precision the layers compute on a GPU; on a CPU always in f32.
     pub(crate) fn set_compute(&mut self, compute: Compute) {
-        let compute = if ops::is_cpu(&self.cls_token.val().device()) { Compute::F32 } else { compute };
+        let compute = if compute::is_cpu(&self.cls_token.val().device()) { Compute::F32 } else { compute };
         for layer in &mut self.layers {
             for linear in [&mut layer.qkv, &mut layer.out, &mut layer.mlp_in, &mut layer.mlp_out] {
                 linear.set_compute(compute);

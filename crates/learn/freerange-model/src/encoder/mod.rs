@@ -14,7 +14,7 @@ use burn::{
 
 pub use dinov2::{Dinov2, WeightsOrigin};
 
-use crate::{EncoderConfig, ModelConfig, PLUCKER, ops::Compute};
+use crate::{EncoderConfig, ModelConfig, PLUCKER, compute::Compute};
 
 /// Turns posed images into image tokens.
 #[derive(Module, Debug)]

@@ -17,6 +17,9 @@ use burn::backend::{Backend, tensor::FloatTensor};
 
 use crate::Compute;
 
+/// Epsilon of both norms.
+pub(crate) const EPS: f32 = 1e-6;
+
 /// A gradient function's results, one per differentiable input.
 pub(crate) type Grads<B, const N: usize> = [FloatTensor<B>; N];
 

@@ -1,4 +1,7 @@
-use burn::optim::{AdamWConfig, GradientsParams};
+use burn::{
+    optim::{AdamWConfig, GradientsParams},
+    tensor::Gradients,
+};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 

@@ -3,7 +3,7 @@
 use burn::tensor::{Device, Tensor};
 
 use super::{Ranks, Wire};
-use crate::{TrainError, optimizer::Flat};
+use crate::{TrainError, flat::Flat};
 
 /// What one rank brings.
 pub(crate) struct Own {

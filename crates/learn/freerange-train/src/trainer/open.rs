@@ -1,14 +1,15 @@
 //! The start of a run, or its continuation: what all ranks have to agree on before the first step.
 
-use std::{path::Path, rc::Rc, sync::Arc};
+use std::{path::Path, sync::Arc};
 
 use burn::tensor::Device;
 use freerange_data::{Making, ObjectSource};
-use freerange_model::{Checkpoint, Compute, Dinov2, EncoderConfig, EncoderWeights, FreeRange, WeightsOrigin};
+use freerange_model::{Compute, Dinov2, EncoderConfig, EncoderWeights, FreeRange, WeightsOrigin};
 use freerange_util::{Invalid, sha256};
 
 use super::{
     Trainer,
+    among::{Among, Initial},
     encoder::{load_encoder, require_same_encoder, require_same_model},
     folder::claim,
     lanes::lanes,
@@ -19,36 +20,10 @@ use crate::{
     TrainError,
     batch::step_rng,
     config::TrainConfig,
-    ranks::{Ranks, Single, agree, from_first, same_on_all},
+    ranks::{Ranks, agree, from_first, same_on_all},
     validation::Validation,
 };
 use freerange_diffusion::photometric::Photometric;
-
-/// Weights that a new run starts from.
-#[derive(Clone, Copy, Debug)]
-pub struct Initial<'a> {
-    /// The weights, of the same architecture.
-    pub checkpoint: &'a Checkpoint,
-    /// Normalise Gaussians by the statistics of the run's own data, not by the checkpoint's: for data that
-    /// are made in another way, such as fits instead of points on the surface.
-    pub remeasure: bool,
-}
-
-/// The processes that share a run.
-#[derive(Clone)]
-pub struct Among {
-    /// All of them.
-    pub ranks: Rc<dyn Ranks>,
-    /// Names and values of what has to be the same on all ranks, besides configuration, data and encoder: such as the program.
-    pub identity: Vec<(String, String)>,
-}
-
-impl Among {
-    /// One process alone.
-    pub fn single() -> Self {
-        Self { ranks: Rc::new(Single), identity: Vec::new() }
-    }
-}
 
 impl Trainer {
     /// Starts a run in `folder`, or goes on with the one that is there.

@@ -8,7 +8,8 @@ use freerange_gaussians::channel;
 use super::{StepReport, Trainer};
 use crate::{
     TrainError,
-    optimizer::{Flat, Step},
+    flat::Flat,
+    optimizer::Step,
     ranks::{Agreed, Layout, Own},
     train,
 };

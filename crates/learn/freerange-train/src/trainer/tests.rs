@@ -15,7 +15,7 @@ use super::{
 };
 use crate::{
     config::{DataConfig, Stage},
-    optimizer::Flat,
+    flat::Flat,
     ranks::threads::among,
     train,
 };

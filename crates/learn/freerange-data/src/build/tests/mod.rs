@@ -16,7 +16,8 @@ use image::RgbaImage;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::build::folder::{FileFacts, build_with};
+use crate::build::folder::build_with;
+use crate::build::item_object::FileFacts;
 use crate::build::object::{MadeObject, generated_id};
 use crate::build::{BuildConfig, BuildError, BuildOptions, Item, Items, ObjectConfig, Seconds, ShardConfig, Summary};
 use crate::layout::{END, object_bytes};

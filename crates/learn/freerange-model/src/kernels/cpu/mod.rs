@@ -6,8 +6,10 @@
 //! are f32.
 
 mod attention;
+mod head;
 mod linear;
 mod math;
+mod matrix;
 mod pointwise;
 #[cfg(target_arch = "x86_64")]
 mod tiles;

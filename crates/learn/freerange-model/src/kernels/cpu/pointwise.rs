@@ -8,7 +8,7 @@ use multiversion::multiversion;
 use rayon::prelude::*;
 
 use super::{contiguous, dims, into_values, linear::ROWS, math, tensor, values};
-use crate::ops::EPS;
+use crate::kernels::EPS;
 
 /// Calls `f(first row, rows of out)` for pieces of `ROWS` rows that do not cross batch elements, in parallel, and
 /// collects what it returns: `[b][pieces per batch element]`.

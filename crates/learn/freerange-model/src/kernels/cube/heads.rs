@@ -12,7 +12,7 @@ use super::{
     reduce::{across, group_sum, total},
     shaped, spread,
 };
-use crate::ops::EPS;
+use crate::kernels::EPS;
 
 /// Sizes of an attention.
 #[derive(Clone, Copy)]

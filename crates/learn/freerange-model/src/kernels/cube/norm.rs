@@ -10,7 +10,7 @@ use super::{
     reduce::{across, cube_sum, total},
     spaced, units,
 };
-use crate::ops::EPS;
+use crate::kernels::EPS;
 
 /// A row of `vectors` vectors that starts at `base`, its share of each unit in registers.
 #[cube]

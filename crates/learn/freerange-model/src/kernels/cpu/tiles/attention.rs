@@ -4,9 +4,9 @@ use multiversion::multiversion;
 
 use super::{
     super::{
-        attention::{Saved, Sizes, Weights, gather, gather_backward, softmax_rows},
-        linear::Matrix,
+        head::{Saved, Sizes, Weights, gather, gather_backward, softmax_rows},
         math,
+        matrix::Matrix,
     },
     Destination, SIDE, Start, Tile, Unit,
     pack::{Lines, tiles},

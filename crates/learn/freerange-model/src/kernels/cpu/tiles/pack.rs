@@ -1,6 +1,6 @@
 //! Operands of the tile unit, packed.
 
-use super::{super::linear::Matrix, LINES, SIDE, Tile, available};
+use super::{super::matrix::Matrix, LINES, SIDE, Tile, available};
 
 /// How many tiles so many lines of this depth take.
 pub fn tiles(lines: usize, depth: usize) -> usize {

@@ -7,7 +7,7 @@
 use rayon::prelude::*;
 
 use super::{
-    super::{Shared, linear::Matrix},
+    super::{Shared, matrix::Matrix},
     Destination, SIDE, Start, Tile, Unit,
     pack::Lines,
     with_tiles,

@@ -2,7 +2,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::{
-    super::{attention::Sizes, linear::Matrix},
+    super::{head::Sizes, matrix::Matrix},
     *,
 };
 
