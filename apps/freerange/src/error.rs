@@ -9,6 +9,9 @@ use freerange_optim::FitError;
 use freerange_train::TrainError;
 use freerange_util::system_failed;
 
+/// What shells expect of a program that a signal has ended, if it is Ctrl-C.
+pub const EXIT_CODE: u8 = 130;
+
 /// Why a command ended without its result.
 #[derive(Debug)]
 pub struct CliError {
@@ -42,7 +45,7 @@ impl CliError {
 
     /// What was asked to end did so in order; the text says what there is now.
     pub fn asked_to_end(text: &str) -> Self {
-        Self { source: format!("asked to end: {text}").into(), code: crate::signals::EXIT_CODE, agreed: false }
+        Self { source: format!("asked to end: {text}").into(), code: EXIT_CODE, agreed: false }
     }
 
     /// Whether all ranks end with it.

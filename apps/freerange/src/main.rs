@@ -16,7 +16,8 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
-use signals::{EXIT_CODE, Signals};
+use error::EXIT_CODE;
+use signals::Signals;
 
 /// Posed photos in, 3D Gaussians out.
 ///

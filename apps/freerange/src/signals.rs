@@ -2,9 +2,6 @@
 
 use crate::error::CliError;
 
-/// What shells expect of a program that a signal has ended, if it is Ctrl-C.
-pub const EXIT_CODE: u8 = 130;
-
 /// The signals, kept for the thread that waits for them. On other systems than Unix they end the program at once.
 pub struct Signals;
 

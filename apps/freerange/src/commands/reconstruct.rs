@@ -2,6 +2,7 @@
 
 mod batch;
 mod holdout;
+mod written;
 
 use std::{
     ops::ControlFlow,
@@ -15,15 +16,13 @@ use freerange::{
     read_gaussians, score,
 };
 use freerange_eval::memory::peak_memory;
-use freerange_gaussians::formats::{Format, Frame, WriteOptions};
+use freerange_gaussians::formats::Frame;
 use freerange_gaussians::{Splats, write_ply_at};
-use freerange_optim::meshing::{MeshConfig, MeshFormat, mesh_of, save};
 use freerange_scene::camera::{
     FrameConfig, canonical_from_user,
     image_ops::{sheet, to_picture},
 };
-use freerange_scene::{views_to_compare, write_colmap};
-use freerange_util::{Note, NoteKind};
+use freerange_util::Note;
 use serde::Serialize;
 
 use crate::{
@@ -31,6 +30,7 @@ use crate::{
     runtime::commit,
 };
 use holdout::Holdout;
+use written::{Place, Written, parse_written};
 
 /// Reconstruct an object from posed photos.
 ///
@@ -88,40 +88,6 @@ const EXAMPLES: &str = "Examples:
   freerange reconstruct photos --masks estimate             photos on a table, with COLMAP's cameras
   freerange reconstruct photos --holdout-every 8 --quality high
   freerange reconstruct a b c -o results                    three scenes and a table of them";
-
-/// What results are written as.
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum Written {
-    /// A file of Gaussians.
-    Gaussians(Format),
-    /// COLMAP's sparse model.
-    Colmap,
-    /// A triangle mesh.
-    Mesh(MeshFormat),
-}
-
-fn parse_written(text: &str) -> Result<Written, String> {
-    match text {
-        "colmap" => Ok(Written::Colmap),
-        "mesh.glb" => Ok(Written::Mesh(MeshFormat::Glb)),
-        "mesh.ply" => Ok(Written::Mesh(MeshFormat::Ply)),
-        "mesh.obj" => Ok(Written::Mesh(MeshFormat::Obj)),
-        other => other
-            .parse()
-            .map(Written::Gaussians)
-            .map_err(|expected: String| format!("{expected}, colmap, mesh.glb, mesh.ply, mesh.obj")),
-    }
-}
-
-impl std::fmt::Display for Written {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Self::Gaussians(format) => format.fmt(f),
-            Self::Colmap => f.write_str("colmap"),
-            Self::Mesh(format) => write!(f, "mesh.{format}"),
-        }
-    }
-}
 
 fn shard(text: &str) -> Result<(usize, usize), String> {
     let parts = text.split_once('/').and_then(|(i, n)| Some((i.parse().ok()?, n.parse().ok()?)));
@@ -327,56 +293,7 @@ fn reconstruct(
     let frame = Frame::with_up(result.up()).unwrap_or_default();
     let mut samples = Vec::new();
     for (i, sample) in result.samples.iter().enumerate() {
-        let suffix = if i == 0 { String::new() } else { format!("-{i}") };
-        let file = format!("gaussians{suffix}.ply");
-        write_ply_at(&sample.gaussians, origin, &output.path(&file)?)?;
-        let splats = Splats { origin: origin.unwrap_or_default().into(), ..sample.gaussians.clone().into() };
-        let mut mesh = None; // one for all of its formats
-        for format in &args.format {
-            let format = match format {
-                Written::Mesh(format) => {
-                    let name = format!("mesh{suffix}.{format}");
-                    match mesh.get_or_insert_with(|| mesh_of(&splats, &MeshConfig::default())) {
-                        Ok(mesh) => save(mesh, &output.path(&name)?, frame.to(Frame::Y_UP))?,
-                        // The Gaussians are there all the same.
-                        Err(e) => notes.push(Note::dropped(format!("{name}: {e}"))),
-                    }
-                    continue;
-                }
-                Written::Gaussians(Format::Ply) => continue,
-                Written::Gaussians(format) => format,
-                Written::Colmap => {
-                    let folder = output.path(&format!("colmap{suffix}/sparse"))?;
-                    write_colmap(
-                        folder.parent().unwrap_or(&folder),
-                        &inputs,
-                        origin.unwrap_or_default().into(),
-                        &points(&sample.gaussians),
-                    )?;
-                    continue;
-                }
-            };
-            let name = if *format == Format::Html { "view" } else { "gaussians" };
-            let options = WriteOptions { frame, ..WriteOptions::default() };
-            let path = output.path(&format!("{name}{suffix}.{format}"))?;
-            let lost = freerange_gaussians::formats::write(&splats, &path, &options)?;
-            notes.extend(lost.into_iter().map(|note| Note::dropped(format!("{name}{suffix}.{format}: {note}"))));
-        }
-        write_turntable(&output.path(&format!("turntable{suffix}.gif"))?, &sample.canonical, 48, 256)?;
-        for (view, picture) in comparisons(&sample.gaussians, &inputs)? {
-            output.picture(&format!("inputs{suffix}/{view}.png"), &picture)?;
-        }
-        let before_optimization = match &sample.before_optimization {
-            None => None,
-            Some(plain) => Some(Before { input_views: score(plain, &inputs)?, further_views: score(plain, &further)? }),
-        };
-        samples.push(SampleReport {
-            seed: sample.seed,
-            file,
-            input_views: score(&sample.gaussians, &inputs)?,
-            further_views: score(&sample.gaussians, &further)?,
-            before_optimization,
-        });
+        samples.push(write_sample(&output, sample, i, frame, origin, &args.format, &inputs, &further, &mut notes)?);
     }
     seconds.push(("write", begin.elapsed().as_secs_f64()));
 
@@ -403,14 +320,39 @@ fn reconstruct(
     Ok((report, json))
 }
 
-/// Opacity below which a Gaussian is no point of the surface.
-const FAINT: f64 = 0.1;
-
-/// Gaussians as points: middles and colors.
-fn points(cloud: &freerange::Cloud) -> Vec<(glam::DVec3, [u8; 3])> {
-    let byte = |v: f64| (255.0 * v.clamp(0.0, 1.0)).round() as u8;
-    let solid = (0..cloud.len()).filter(|i| cloud.opacity(*i) >= FAINT);
-    solid.map(|i| (cloud.mean(i), cloud.color(i).to_array().map(byte))).collect()
+/// Writes the files of sample number `i`; what the report says of it.
+fn write_sample(
+    output: &OutputFolder,
+    sample: &freerange::Sample,
+    i: usize,
+    frame: Frame,
+    origin: Option<[f64; 3]>,
+    formats: &[Written],
+    inputs: &[View],
+    further: &[View],
+    notes: &mut Vec<Note>,
+) -> Result<SampleReport, CliError> {
+    let suffix = if i == 0 { String::new() } else { format!("-{i}") };
+    let file = format!("gaussians{suffix}.ply");
+    write_ply_at(&sample.gaussians, origin, &output.path(&file)?)?;
+    let splats = Splats { origin: origin.unwrap_or_default().into(), ..sample.gaussians.clone().into() };
+    let place = Place { output, suffix: &suffix, frame, origin: origin.unwrap_or_default() };
+    notes.extend(place.write(&splats, formats, inputs)?);
+    write_turntable(&output.path(&format!("turntable{suffix}.gif"))?, &sample.canonical, 48, 256)?;
+    for (view, picture) in comparisons(&sample.gaussians, inputs)? {
+        output.picture(&format!("inputs{suffix}/{view}.png"), &picture)?;
+    }
+    let before_optimization = match &sample.before_optimization {
+        None => None,
+        Some(plain) => Some(Before { input_views: score(plain, inputs)?, further_views: score(plain, further)? }),
+    };
+    Ok(SampleReport {
+        seed: sample.seed,
+        file,
+        input_views: score(&sample.gaussians, inputs)?,
+        further_views: score(&sample.gaussians, further)?,
+        before_optimization,
+    })
 }
 
 /// A transform from positions relative to `origin`, for positions as the scene has them.

@@ -49,6 +49,7 @@ mod config;
 mod device;
 mod error;
 mod files;
+mod frame;
 #[doc(hidden)]
 pub mod internal;
 pub mod machine;
@@ -67,6 +68,7 @@ pub use config::{
 pub use device::{Device, DeviceInfo, DeviceName, DeviceProperties, GpuApi};
 pub use error::{Cause, Error};
 pub use files::{read_gaussians, write_gaussians};
+pub use frame::{choose_views, to_canonical, to_user};
 pub use freerange_diffusion::sample::{FlowConfig, RefinerConfig, SETTINGS_SCHEMA};
 pub use freerange_gaussians::{Cloud, RenderMode, Splats};
 pub use freerange_model::Compute;
@@ -80,7 +82,7 @@ pub use freerange_scene::{
 pub use freerange_util::{Note, NoteKind};
 pub use glam;
 pub use image;
-pub use pipeline::{Reconstruction, Sample, choose_views, to_canonical, to_user};
+pub use pipeline::{Reconstruction, Sample};
 pub use progress::{Progress, Stage};
 pub use reconstructor::Reconstructor;
 pub use scene::{Scene, cut_out};

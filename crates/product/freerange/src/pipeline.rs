@@ -23,13 +23,12 @@ mod watch;
 use std::{ops::ControlFlow, path::Path};
 
 pub(crate) use canonical::CanonicalScene;
-pub use canonical::{choose_views, to_canonical, to_user};
 use freerange_gaussians::Cloud;
 use freerange_scene::camera::{Similarity, View};
 use freerange_util::Note;
 use glam::DVec3;
 
-use crate::{Error, Options, Progress, Reconstructor, Scene, Stage, write_gaussians};
+use crate::{Error, Options, Progress, Reconstructor, Scene, Stage, to_user, write_gaussians};
 use watch::Watch;
 
 /// One sample.

@@ -26,6 +26,8 @@ mod cpu;
 mod error;
 #[cfg(feature = "gpu")]
 mod gpu;
+#[cfg(feature = "op")]
+mod job;
 pub mod metrics;
 mod mip;
 #[cfg(feature = "op")]

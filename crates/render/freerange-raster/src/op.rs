@@ -2,7 +2,9 @@
 
 #[cfg(feature = "gpu")]
 use crate::gpu;
-use crate::{CHANNELS, RasterConfig, RasterError, cpu};
+#[cfg(feature = "gpu")]
+use crate::job::Tuning;
+use crate::{CHANNELS, RasterConfig, RasterError, cpu, job::Job};
 use burn::backend::{
     Autodiff, Backend, Dispatch, Flex,
     autodiff::{
@@ -55,7 +57,7 @@ pub fn rasterize(
         backgrounds,
         config,
         #[cfg(feature = "gpu")]
-        gpu::Tuning::default(),
+        Tuning::default(),
     )
 }
 
@@ -65,7 +67,7 @@ pub(crate) fn run(
     cameras: &[Vec<Camera>],
     backgrounds: &[Vec<[f32; 3]>],
     config: &RasterConfig,
-    #[cfg(feature = "gpu")] tuning: gpu::Tuning,
+    #[cfg(feature = "gpu")] tuning: Tuning,
 ) -> Result<Tensor<5>, RasterError> {
     let found = gaussians.dims();
     let [objects, _, channels] = found;
@@ -99,20 +101,6 @@ pub(crate) fn run(
         tuning,
     });
     Ok(Tensor::from_dispatch(Dispatch::rasterize(gaussians.into_dispatch(), job, None)))
-}
-
-/// What to render: plain data that travels through the backends.
-#[derive(Debug)]
-pub struct Job {
-    pub(crate) objects: usize,
-    pub(crate) views: usize,
-    pub(crate) width: usize,
-    pub(crate) height: usize,
-    pub(crate) cameras: Vec<Camera>,       // [objects * views]
-    pub(crate) backgrounds: Vec<[f32; 3]>, // [objects * views]
-    pub(crate) config: RasterConfig,
-    #[cfg(feature = "gpu")]
-    pub(crate) tuning: gpu::Tuning,
 }
 
 /// Where the forward pass puts what the backward pass needs, if somebody will want it: the state of whichever backend.

@@ -2,7 +2,7 @@
 
 use std::{ops::ControlFlow, path::Path, time::Instant};
 
-use burn::tensor::{Distribution, Tensor};
+use burn::tensor::{Device, Distribution, Tensor};
 use freerange_data::build::{GaussianSource, generate_object};
 use freerange_diffusion::{
     conditioning::Conditioning,
@@ -11,7 +11,7 @@ use freerange_diffusion::{
     sample::{FlowConfig, FlowSampler},
     targets::Images,
 };
-use freerange_gaussians::Statistics;
+use freerange_gaussians::{Normalization, Statistics};
 use freerange_model::{Checkpoint, Compute, EncoderConfig, Execution, FreeRange, ModelConfig, ModelInfo, Workload};
 use freerange_scene::camera::View;
 use freerange_train::{config::Stage, trainer::Trainer};
@@ -88,6 +88,24 @@ pub(super) fn load(size: &str) -> Result<TrainConfig, CliError> {
     Ok(config)
 }
 
+/// A model of random weights: time does not depend on them.
+fn untrained(
+    config: &ModelConfig,
+    normalization: Normalization,
+    depth: u32,
+    device: &Device,
+) -> Result<Checkpoint, CliError> {
+    let rng = &mut rand_chacha::ChaCha8Rng::seed_from_u64(1);
+    Ok(Checkpoint {
+        model: FreeRange::new(config, rng, device)?,
+        config: config.clone(),
+        normalization,
+        gradient_rms: [1.0; 14],
+        depth,
+        provenance: serde_json::Value::Null,
+    })
+}
+
 /// Times sampling at the last stage of a configuration.
 pub fn sample(
     timer: &Timer,
@@ -103,15 +121,7 @@ pub fn sample(
     let object = generate_object(7, &config.data.making.object, &[stage.depth])?;
     let mut statistics = Statistics::default();
     statistics.add(object.slice(stage.depth)?)?;
-    let rng = &mut rand_chacha::ChaCha8Rng::seed_from_u64(1);
-    let checkpoint = Checkpoint {
-        model: FreeRange::new(&model_config, rng, device)?,
-        config: model_config.clone(),
-        normalization: statistics.normalization()?,
-        gradient_rms: [1.0; 14],
-        depth: stage.depth,
-        provenance: serde_json::Value::Null,
-    };
+    let checkpoint = untrained(&model_config, statistics.normalization()?, stage.depth, device)?;
     let views: Vec<View> = object.views[..VIEWS].to_vec();
     let batch: Vec<&[View]> = vec![&views; objects];
     let settings = FlowConfig { steps, compute, lod_depth: None, ..config.sample.clone() };

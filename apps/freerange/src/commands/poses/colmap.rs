@@ -6,7 +6,7 @@ use std::{
     process::{Command, Stdio},
 };
 
-use super::engine::{Done, Job, failed};
+use super::job::{Done, Job, failed};
 use crate::{error::CliError, progress::Progress};
 
 /// One of COLMAP's programs, the options that it knows, and those that were passed over.

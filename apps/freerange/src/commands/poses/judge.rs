@@ -7,7 +7,7 @@ use freerange_scene::{LoadConfig, Loaded, Scene, SceneConfig, SceneError, inspec
 use glam::{DMat3, DVec3};
 use serde::Serialize;
 
-use super::engine::Done;
+use super::job::Done;
 use crate::error::CliError;
 
 /// Share of the photos that must have a pose, and their least number.

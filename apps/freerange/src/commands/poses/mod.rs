@@ -2,6 +2,7 @@
 
 mod colmap;
 mod engine;
+mod job;
 mod judge;
 
 use std::{
@@ -13,7 +14,8 @@ use freerange_scene::read::{Format, cameras, in_order, photos_in};
 use serde::Serialize;
 
 use crate::{error::CliError, output::OutputFolder};
-use engine::{Done, Engine, Job};
+use engine::Engine;
+use job::{Done, Job};
 use judge::Judgement;
 
 /// How to photograph, for those whose photos could not be placed.

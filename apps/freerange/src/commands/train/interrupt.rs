@@ -8,7 +8,7 @@ use std::{
     time::Duration,
 };
 
-use crate::signals::EXIT_CODE;
+use crate::error::EXIT_CODE;
 
 /// Among several ranks: for so long, besides two steps, what was asked to end may go on. A rank that waits for one that is
 /// gone waits for ever, and launchers that end the others ask first.

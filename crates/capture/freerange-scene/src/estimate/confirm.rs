@@ -3,7 +3,8 @@
 use super::hull::Hull;
 use super::mask::grown;
 use super::picture::Picture;
-use super::{FINE, Hints, SMALL, expected_radius, meeting_point};
+use super::place::{expected_radius, meeting_point};
+use super::{FINE, Hints, SMALL};
 use crate::camera::View;
 use image::GrayImage;
 use rayon::prelude::*;

@@ -1,51 +1,25 @@
 //! Masks mended with what the other views show: a quick fit of all the others says where the object is in a view, and in which colour.
 
 use super::mask::{enlarged, smooth};
+use super::odds::odds;
 use super::picture;
 use super::plane::Table;
-use super::{LARGE, Masks, Stage, odds};
+use super::shown::Shown;
+use super::{LARGE, Masks, Stage};
 use crate::SceneError;
 use crate::camera::{View, image_ops::resize_area};
-use glam::Vec3;
 use image::RgbaImage;
 use rayon::prelude::*;
 
 /// Times that masks are mended, and the fewest views of which the others know enough for it.
 pub(super) const MENDING: usize = 2;
 pub(super) const LEAST_TO_MEND: usize = 5;
-/// Their alpha and one less it are raised by this before their ratio counts: log odds of 3 at most.
-const DOUBT: f32 = 0.05;
 /// Log odds against what lies outside of the hull, beside what the other views show.
 pub(super) const OUTSIDE_MENDING: f32 = 1.0;
 
 /// Shows each view as all the others have it, by whatever makes a shape of views: straight colour and alpha, in the order and size of the
 /// views, whose alpha is the masks as they are so far. Or says why not.
 pub type OthersShow = fn(&[View]) -> Result<Vec<RgbaImage>, String>;
-
-/// A view as the others have it.
-pub(super) struct Shown {
-    /// `[h, w]`
-    pub(super) alpha: Vec<f32>,
-    /// `[h, w]`, Lab
-    pub(super) colour: Vec<Vec3>,
-    /// How far colours may differ from it and still be the object's (Lab).
-    pub(super) scale: f32,
-}
-
-impl Shown {
-    fn of(image: &RgbaImage, scale: f32) -> Self {
-        Self {
-            alpha: image.pixels().map(|p| f32::from(p[3]) / 255.0).collect(),
-            colour: image.pixels().map(|p| picture::lab([p[0], p[1], p[2]])).collect(),
-            scale,
-        }
-    }
-
-    /// Log odds for the object by what is there alone.
-    pub(super) fn odds(&self, k: usize) -> f32 {
-        ((self.alpha[k] + DOUBT) / (1.0 - self.alpha[k] + DOUBT)).ln()
-    }
-}
 
 impl Stage {
     /// Each view as the others have it, on a larger picture.

@@ -15,8 +15,11 @@ mod mask;
 mod maxflow;
 mod mend;
 mod mixture;
+mod odds;
 mod picture;
+mod place;
 mod plane;
+mod shown;
 
 pub use confirm::confirmed;
 pub use evidence::{Compared, Evidence};
@@ -24,17 +27,19 @@ pub use hull::overlap;
 pub use mend::OthersShow;
 
 use crate::SceneError;
-use crate::camera::{View, cameras_up};
-use glam::{DMat3, DVec3, Vec3};
+use crate::camera::View;
+use glam::{DVec3, Vec3};
 use hull::{Floor, Hull, reaches_border};
 use image::RgbaImage;
 use mask::{enlarged, grown, shrunk, smooth, soft, tidy};
-use maxflow::Grid;
-use mend::{LEAST_TO_MEND, MENDING, OUTSIDE_MENDING, Shown};
+use mend::{LEAST_TO_MEND, MENDING, OUTSIDE_MENDING};
 use mixture::Mixture;
-use picture::{Picture, STEPS};
+use odds::{cut, odds};
+use picture::Picture;
+use place::{expected_radius, mean_up, meeting_point, nearness};
 use plane::{Plane, Table};
 use rayon::prelude::*;
+use shown::Shown;
 
 /// Longer side of the pictures that take turns, and of those that the outline is cut on.
 const SMALL: u32 = 320;
@@ -43,10 +48,6 @@ const LARGE: u32 = 640;
 const TURNS: usize = 10;
 /// Turns end when masks change by less than this share.
 const SETTLED: f64 = 0.002;
-/// What parting two like neighbours costs, in units of a pixel's log odds.
-const SMOOTHNESS: f32 = 40.0;
-/// No pixel's log odds count for more.
-const MOST: f32 = 6.0;
 /// Log odds against what lies outside of the other views' hull.
 const OUTSIDE: f32 = 5.0;
 /// Log odds for what lies within it.
@@ -61,15 +62,6 @@ const SURE: f64 = 0.02;
 /// Voxels along the hull's longest side: while masks change, and to judge them.
 const ROUGH: usize = 56;
 const FINE: usize = 120;
-/// Most that is believed of the table: something else may lie there. Less while masks are mended, where others have a say.
-const TRUST: f32 = 0.99;
-const TRUST_MENDING: f32 = 0.5;
-/// Most that is believed of the colour that the other views show.
-const TRUST_OTHERS: f32 = 0.9;
-/// Costs are whole numbers: this many to one.
-const UNIT: f32 = 1024.0;
-/// Log density of a colour that nobody has seen before: even over Lab.
-const NOVEL: f32 = -12.9;
 /// Components of the mixtures.
 const OBJECT: usize = 5;
 const BACKGROUND: usize = 8;
@@ -215,63 +207,10 @@ struct Masks {
     shown: Vec<[Shown; 2]>,
 }
 
-/// How likely a colour is that is so far from the one expected: a density in three dimensions that falls exponentially, its logarithm.
-fn log_likely(off: f32, scale: f32) -> f32 {
-    -2.0 * off / scale - (std::f32::consts::PI * scale.powi(3)).ln()
-}
-
 /// Masks on larger pictures.
 struct Sharp {
     pictures: Vec<Picture>,
     masks: Vec<Vec<bool>>,
-}
-
-/// The point nearest to the optical axes, in front of all cameras.
-fn meeting_point(views: &[View]) -> Option<DVec3> {
-    let (mut normal, mut right) = (DMat3::ZERO, DVec3::ZERO);
-    for view in views {
-        let d = DMat3::from_mat4(view.camera.world_to_camera).transpose().z_axis;
-        let across = DMat3::IDENTITY - DMat3::from_cols(d * d.x, d * d.y, d * d.z);
-        normal += across;
-        right += across * view.camera.center();
-    }
-    // The determinant falls with the squared angle between the axes; 1e-4 is about one degree.
-    if normal.determinant() < 1e-4 * (views.len() as f64).powi(3) {
-        return None;
-    }
-    let point = normal.inverse() * right;
-    let ahead = |v: &View| (v.camera.world_to_camera * point.extend(1.0)).z > 0.0;
-    (point.is_finite() && views.iter().all(ahead)).then_some(point)
-}
-
-/// Which way is up, as far as the cameras tell.
-fn mean_up(views: &[View]) -> DVec3 {
-    cameras_up(views).unwrap_or(DVec3::Z)
-}
-
-/// How far the ray through a pixel passes by `centre`.
-fn passes_by(picture: &Picture, centre: DVec3, x: f64, y: f64) -> f64 {
-    (centre - picture.camera.center()).cross(picture.camera.ray_direction(x, y)).length()
-}
-
-/// The radius of the sphere about `centre` that the object is expected in: the hint's and a little more, or of the largest that half of the
-/// views show whole, as objects are shown whole. None where most views do not show its middle.
-fn expected_radius(pictures: &[Picture], centre: DVec3, hints: &Hints) -> Option<f64> {
-    let mut radii: Vec<f64> = pictures
-        .iter()
-        .map(|p| {
-            let (w, h) = (p.width() as f64, p.height() as f64);
-            let (x, y, z) = p.project(centre);
-            if z <= 0.0 || x <= 0.0 || y <= 0.0 || x >= w || y >= h {
-                return 0.0;
-            }
-            let border = [(0.0, y), (w, y), (x, 0.0), (x, h)];
-            border.iter().map(|(x, y)| passes_by(p, centre, *x, *y)).fold(f64::INFINITY, f64::min)
-        })
-        .collect();
-    radii.sort_by(f64::total_cmp);
-    let radius = hints.radius.map_or(radii[radii.len() / 2], |r| 1.1 * r);
-    (radius > 0.0).then_some(radius)
 }
 
 impl Stage {
@@ -490,79 +429,9 @@ impl Stage {
     }
 }
 
-fn nearness(picture: &Picture, centre: DVec3, radius: f64) -> Vec<f32> {
-    let (w, h) = (picture.width(), picture.height());
-    let at = |k: usize| passes_by(picture, centre, (k % w) as f64 + 0.5, (k / w) as f64 + 0.5);
-    (0..w * h).map(|k| (at(k) / radius) as f32).collect()
-}
-
 /// Every so manyth colour, so that about `count` are left.
 fn thinned(colours: &[Vec3], count: usize) -> Vec<Vec3> {
     colours.iter().step_by((colours.len() / count).max(1)).copied().collect()
-}
-
-fn log_add(a: f32, b: f32) -> f32 {
-    let most = a.max(b);
-    most + ((a - most).exp() + (b - most).exp()).ln()
-}
-
-/// Log odds of each pixel for the object, at the pixels `wanted`; 0 elsewhere. `[h, w]`
-fn odds(
-    picture: &Picture,
-    object: &Mixture,
-    behind: &Mixture,
-    table: Option<&Table>,
-    shown: Option<&Shown>,
-    wanted: impl Fn(usize) -> bool,
-) -> Vec<f32> {
-    (0..picture.lab.len())
-        .map(|k| {
-            if !wanted(k) {
-                return 0.0;
-            }
-            let colour = picture.lab[k];
-            let rest = log_add(behind.log_density(colour) - 0.05, NOVEL - 3.0);
-            // An object may have any colour that the scene has, if seldom.
-            let own = log_add(log_add(object.log_density(colour) - 0.16, NOVEL - 2.3), rest - 3.0);
-            let rest = match table {
-                Some(table) if table.trust[k] > 0.0 => {
-                    let most = if shown.is_some() { TRUST_MENDING } else { TRUST };
-                    let (trust, scale) = (most * table.trust[k], table.scale[k]);
-                    let off = picture.smooth[k].distance(table.colour[k]);
-                    log_add(trust.ln() + log_likely(off, scale), (1.0 - trust).ln() + rest)
-                }
-                _ => rest,
-            };
-            let own = match shown {
-                Some(shown) if shown.alpha[k] > 0.0 => {
-                    let trust = TRUST_OTHERS * shown.alpha[k];
-                    let off = picture.smooth[k].distance(shown.colour[k]);
-                    log_add(trust.ln() + log_likely(off, shown.scale), (1.0 - trust).ln() + own)
-                }
-                _ => own,
-            };
-            (own - rest).clamp(-MOST, MOST)
-        })
-        .collect()
-}
-
-/// The cheapest cut for these log odds. `bounds`: what is inside in any case, and outside of what nothing is.
-fn cut(picture: &Picture, odds: &[f32], bounds: Option<(&[bool], &[bool])>) -> Vec<bool> {
-    let (w, h) = (picture.width(), picture.height());
-    let mut grid = Grid::new(w, h);
-    for k in 0..w * h {
-        let (x, y) = (k % w, k / w);
-        let odds = match bounds {
-            Some((inner, _)) if inner[k] => 1e4,
-            Some((_, outer)) if !outer[k] => -1e4,
-            _ => odds[k],
-        };
-        grid.set_terminal(x, y, (odds * UNIT) as i32);
-        for which in 0..STEPS.len() {
-            grid.set_edge(x, y, which, (SMOOTHNESS * UNIT * picture.alike[k][which]) as i32);
-        }
-    }
-    grid.cut()
 }
 
 /// Whether masks at full size reach the border of their views.

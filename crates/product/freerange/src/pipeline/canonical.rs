@@ -6,13 +6,11 @@
 
 use freerange_gaussians::Cloud;
 use freerange_optim::{frame_of, quick_fit};
-use freerange_scene::camera::{
-    CanonicalFrame, FrameConfig, Similarity, View, Window, canonical_from_user, inputs_around,
-};
+use freerange_scene::camera::{Similarity, View, Window};
 use freerange_util::Note;
 
 use super::watch::Watch;
-use crate::{Detect, Error, Options, Stage, error::Lift};
+use crate::{Detect, Error, Options, Stage, choose_views, to_canonical};
 
 /// The views of an object in the canonical frame.
 pub(crate) struct CanonicalScene {
@@ -115,31 +113,6 @@ impl CanonicalScene {
     }
 }
 
-/// Restarts of k-means, as in the evaluation.
-const RESTARTS: usize = 10;
-/// At most `most` views from all around the object, as the paper's protocol chooses them; ascending.
-///
-/// # Errors
-/// If the cameras do not allow a choice.
-pub fn choose_views(views: &[View], most: usize) -> Result<Vec<usize>, Error> {
-    let centers: Vec<_> = views.iter().map(|v| v.camera.center()).collect();
-    if views.len() <= most {
-        return Ok((0..views.len()).collect());
-    }
-    // Of views from one place the first is enough.
-    let size = centers.iter().map(|c| c.distance(centers[0])).fold(0.0, f64::max);
-    let mut places: Vec<usize> = Vec::new();
-    for i in 0..views.len() {
-        if places.iter().all(|&j| centers[i].distance(centers[j]) > 1e-6 * size) {
-            places.push(i);
-        }
-    }
-    match places.len() <= most {
-        true => Ok(places),
-        false => inputs_around(&centers, &places, most, RESTARTS, 0).lift(),
-    }
-}
-
 /// Refuses views whose parts do not fit each other.
 fn check_views(views: &[View]) -> Result<(), Error> {
     for view in views {
@@ -155,23 +128,4 @@ fn check_views(views: &[View]) -> Result<(), Error> {
         }
     }
     Ok(())
-}
-
-/// The views in the canonical frame, and how they got there.
-///
-/// # Errors
-/// If there are fewer than two views, or they do not show one object from different places.
-pub fn to_canonical(views: &[View], config: &FrameConfig) -> Result<(CanonicalFrame, Vec<View>), Error> {
-    let frame = canonical_from_user(views, config).lift()?;
-    let moved = |v: &View| View { camera: v.camera.transformed(&frame.canonical_from_user), ..v.clone() };
-    let canonical = views.iter().map(moved).collect();
-    Ok((frame, canonical))
-}
-
-/// Takes Gaussians from the canonical frame to the user's.
-pub fn to_user(cloud: &Cloud, canonical_from_user: &Similarity) -> Cloud {
-    let back = canonical_from_user.inverse();
-    let mut cloud = cloud.clone();
-    cloud.transform(back.scale, back.rotation, back.translation);
-    cloud
 }

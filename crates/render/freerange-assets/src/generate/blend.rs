@@ -84,22 +84,10 @@ pub fn blend(blobs: &[Blob], soft: f32, cells: usize) -> Part {
         for y in 0..n.y - 1 {
             for x in 0..n.x - 1 {
                 let base = IVec3::new(x, y, z);
-                let corner = |k: i32| base + IVec3::new(k & 1, k >> 1 & 1, k >> 2 & 1);
-                let (mut sum, mut count) = (Vec3::ZERO, 0);
-                for k in 0..8 {
-                    let v = values[index(corner(k))];
-                    for axis in [1, 2, 4] {
-                        if k & axis == 0 {
-                            let w = values[index(corner(k | axis))];
-                            if (v < 0.0) != (w < 0.0) {
-                                sum += at(corner(k)).lerp(at(corner(k | axis)), v / (v - w));
-                                count += 1;
-                            }
-                        }
-                    }
-                }
-                if count > 0 {
-                    let p = sum / count as f32;
+                let corners: [IVec3; 8] = std::array::from_fn(|k| {
+                    base + IVec3::new((k & 1) as i32, (k >> 1 & 1) as i32, (k >> 2 & 1) as i32)
+                });
+                if let Some(p) = crossing(corners.map(|c| values[index(c)]), corners.map(at)) {
                     let uv = Vec2::new(p.y.atan2(p.x) / std::f32::consts::TAU + 0.5, (p.z - lo.z) / (hi.z - lo.z));
                     vertices[index(base)] = part.vertex(p, uv);
                 }
@@ -129,4 +117,22 @@ pub fn blend(blobs: &[Blob], soft: f32, cells: usize) -> Part {
         }
     }
     part
+}
+
+/// The mean of where the edges of a cell cross the surface; none where none does. Corner k lies at k's bits.
+fn crossing(values: [f32; 8], corners: [Vec3; 8]) -> Option<Vec3> {
+    let (mut sum, mut count) = (Vec3::ZERO, 0);
+    for k in 0..8 {
+        let v = values[k];
+        for axis in [1, 2, 4] {
+            if k & axis == 0 {
+                let w = values[k | axis];
+                if (v < 0.0) != (w < 0.0) {
+                    sum += corners[k].lerp(corners[k | axis], v / (v - w));
+                    count += 1;
+                }
+            }
+        }
+    }
+    (count > 0).then(|| sum / count as f32)
 }

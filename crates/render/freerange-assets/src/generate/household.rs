@@ -6,9 +6,9 @@ use glam::{Affine3A, Quat, Vec2, Vec3};
 use rand::Rng;
 
 use crate::generate::label::Face;
-use crate::generate::objects::{deform, primitive};
 use crate::generate::palette::{self, Tone};
 use crate::generate::part::Assembly;
+use crate::generate::primitive::{deform, primitive};
 use crate::generate::shapes::{self, Span};
 use crate::generate::style::Style;
 use crate::mesh::Texture;

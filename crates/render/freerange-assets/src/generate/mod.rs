@@ -4,12 +4,15 @@
 //! function of seed and configuration.
 
 mod blend;
+mod bottle;
 mod canvas;
+mod caps;
 mod config;
 mod decor;
 mod glyph;
 mod handles;
 mod household;
+mod jar;
 mod label;
 mod materials;
 mod motif;
@@ -17,9 +20,11 @@ mod objects;
 mod packaging;
 mod palette;
 mod part;
+mod primitive;
 mod shapes;
 mod soft;
 mod style;
+mod toys;
 mod turned;
 mod vessels;
 mod woven;

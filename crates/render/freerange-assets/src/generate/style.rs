@@ -180,30 +180,36 @@ impl<'a> Style<'a> {
                 let colors = (0..n).map(|i| if i % 2 == 0 { a } else { self.partner(a) }).collect();
                 Texture::Bands { direction: self.axis(), stops, colors }
             }
-            76..84 => {
-                let over = if self.chance(0.5) { self.speckle(b) } else { Texture::Flat(b) };
-                Texture::Patches {
-                    base: Box::new(Texture::Flat(a)),
-                    over: Box::new(over),
-                    scale: self.log(2.0, 15.0),
-                    threshold: self.range(0.4, 0.65),
-                    soft: if self.chance(0.6) { 0.01 } else { self.range(0.02, 0.15) },
-                    seed,
-                }
-            }
+            76..84 => self.patches(a, b, seed),
             84..91 => self.speckle(a),
-            _ => {
-                let scheme = Scheme { ground: a, ..self.scheme() };
-                let (w, h) = (self.count(128, 320), self.count(128, 256));
-                if self.chance(0.5) {
-                    let colors = [scheme.ink, scheme.accent];
-                    return Texture::Print(Arc::new(decor::decor(&mut self.rng, a, colors, w, h)));
-                }
-                let face = if self.chance(0.7) { Face::Front } else { Face::Side };
-                let product = Product::random(&mut self.rng, &scheme);
-                Texture::Print(Arc::new(product.draw(&mut self.rng, face, w, h)))
-            }
+            _ => self.drawing(a),
         }
+    }
+
+    /// `b` over `a` where noise is high.
+    fn patches(&mut self, a: Vec3, b: Vec3, seed: u32) -> Texture {
+        let over = if self.chance(0.5) { self.speckle(b) } else { Texture::Flat(b) };
+        Texture::Patches {
+            base: Box::new(Texture::Flat(a)),
+            over: Box::new(over),
+            scale: self.log(2.0, 15.0),
+            threshold: self.range(0.4, 0.65),
+            soft: if self.chance(0.6) { 0.01 } else { self.range(0.02, 0.15) },
+            seed,
+        }
+    }
+
+    /// Ornaments or a label on the ground colour `a`.
+    fn drawing(&mut self, a: Vec3) -> Texture {
+        let scheme = Scheme { ground: a, ..self.scheme() };
+        let (w, h) = (self.count(128, 320), self.count(128, 256));
+        if self.chance(0.5) {
+            let colors = [scheme.ink, scheme.accent];
+            return Texture::Print(Arc::new(decor::decor(&mut self.rng, a, colors, w, h)));
+        }
+        let face = if self.chance(0.7) { Face::Front } else { Face::Side };
+        let product = Product::random(&mut self.rng, &scheme);
+        Texture::Print(Arc::new(product.draw(&mut self.rng, face, w, h)))
     }
 
     /// Small spots on a plain ground, like stoneware.

@@ -149,3 +149,8 @@ pub fn turned(spans: &[Span], section: shapes::Section, relief: Option<(Relief, 
         depth * fade * relief.height(turn, p.y)
     })
 }
+
+/// Round but for this share: squares with soft corners.
+pub fn plain_section(s: &mut Style, share: f64) -> Box<dyn Fn(f32) -> Vec2> {
+    if s.chance(share) { Box::new(shapes::superellipse(Vec2::ONE, s.range(2.5, 6.0))) } else { Box::new(shapes::round) }
+}

@@ -1,9 +1,10 @@
-//! Open vessels and what is served from them: mugs, bowls, plates, pans, teapots and jugs, jars, candles.
+//! Open vessels and what is served from them: mugs, bowls, plates, pans, teapots and jugs; and lamps.
 
 use std::f32::consts::{FRAC_PI_2, PI, TAU};
 
 use glam::{Quat, Vec2, Vec3};
 
+use crate::generate::caps::{CREASE, lid};
 use crate::generate::decor::rosette;
 use crate::generate::handles::{self, Mount, handle};
 use crate::generate::label::Face;
@@ -11,15 +12,8 @@ use crate::generate::palette::{self, Tone};
 use crate::generate::part::Assembly;
 use crate::generate::shapes::{self, Span};
 use crate::generate::style::Style;
-use crate::generate::turned::{Relief, turned, walls};
+use crate::generate::turned::{Relief, plain_section, turned, walls};
 use crate::mesh::Texture;
-
-/// Rounding of creases in turned bodies.
-const CREASE: f32 = 42.0;
-
-fn plain_section(s: &mut Style, share: f64) -> Box<dyn Fn(f32) -> Vec2> {
-    if s.chance(share) { Box::new(shapes::superellipse(Vec2::ONE, s.range(2.5, 6.0))) } else { Box::new(shapes::round) }
-}
 
 pub fn mug(a: &mut Assembly, s: &mut Style) {
     let mut outside = s.ceramic();
@@ -270,34 +264,6 @@ pub fn pan(a: &mut Assembly, s: &mut Style) {
     }
 }
 
-/// A domed lid with a knob, its rim at (radius, height).
-fn lid(a: &mut Assembly, s: &mut Style, at: Vec2, [body, knob]: [u16; 2]) {
-    let (r, z) = (at.x, at.y);
-    let dome = s.range(0.1, 0.45) * r;
-    let profile = [
-        Vec2::new(0.0, z - 0.02),
-        Vec2::new(0.9 * r, z - 0.02),
-        Vec2::new(r, z),
-        Vec2::new(r, z + 0.02),
-        Vec2::new(0.6 * r, z + 0.75 * dome),
-        Vec2::new(0.0, z + dome),
-    ];
-    let span = [Span { points: shapes::fillet(&profile, 0.08 * r, 4), material: body }];
-    a.add(shapes::lathe(&span, 40, &shapes::round, 0.1), CREASE);
-    let (k, tall) = (s.range(0.1, 0.2) * r, s.range(0.15, 0.3) * r);
-    let top = z + dome - 0.06 * r;
-    let profile = [
-        Vec2::new(0.0, top),
-        Vec2::new(0.6 * k, top),
-        Vec2::new(0.45 * k, top + 0.5 * tall),
-        Vec2::new(k, top + 0.75 * tall),
-        Vec2::new(0.7 * k, top + tall),
-        Vec2::new(0.0, top + tall),
-    ];
-    let span = [Span { points: shapes::fillet(&profile, 0.3 * k, 3), material: knob }];
-    a.add(shapes::lathe(&span, 20, &shapes::round, 0.2), CREASE);
-}
-
 /// Teapots, kettles, jugs, coffee pots, watering cans.
 pub fn teapot(a: &mut Assembly, s: &mut Style) {
     let body = match s.count(0, 6) {
@@ -360,108 +326,6 @@ pub fn teapot(a: &mut Assembly, s: &mut Style) {
         let reach = s.range(0.2, 0.4);
         handle(a, s, Mount { low, high, reach, material: grip, angle: 0.0 });
     }
-}
-
-/// Jars with lids, vases, planters, candle glasses.
-pub fn jar(a: &mut Assembly, s: &mut Style) {
-    let body = match s.count(0, 3) {
-        0 => s.glass(),
-        1 => s.ceramic(),
-        _ => {
-            let color = s.color();
-            s.plain(color)
-        }
-    };
-    let (r, h) = (s.range(0.3, 0.5), s.range(0.45, 1.2));
-    let neck = r * s.range(0.65, 1.0);
-    let shoulder = s.range(0.05, 0.2);
-    let wall = s.range(0.015, 0.03);
-    let corners = [
-        Vec2::new(0.85 * r, 0.0),
-        Vec2::new(r, 0.06),
-        Vec2::new(r, h),
-        Vec2::new(neck, h + shoulder),
-        Vec2::new(neck, h + shoulder + 0.08),
-    ];
-    let side = shapes::fillet(&corners, 0.05, 4);
-    let w = walls(&side, wall, 0.0);
-    // The label sits on the straight part.
-    let (low, high) = (s.range(0.12, 0.25) * h, s.range(0.75, 0.92) * h);
-    let labelled = s.chance(0.65);
-    let label = if labelled {
-        let mut scheme = s.scheme();
-        if s.chance(0.5) {
-            scheme.ground = body.albedo(Vec3::ZERO, Vec2::splat(0.5));
-        }
-        let product = s.product(&scheme);
-        let face = if s.chance(0.5) { Face::Sticker } else { Face::Wrap };
-        s.print(&product, face, Vec2::new(1.15, 1.15 * (high - low) / (TAU * r)))
-    } else {
-        body.clone()
-    };
-    let cap = match s.count(0, 4) {
-        0..2 => s.metal(),
-        2 => {
-            let wood = s.wood();
-            s.finish(wood)
-        }
-        _ => {
-            let color = s.color();
-            s.plain(color)
-        }
-    };
-    let fill = if s.chance(0.5) { body.clone() } else { s.material() };
-    let [body, label, cap, fill] = [body, label, cap, fill].map(|m| a.material(m));
-    let split = w.outer.iter().position(|p| p.y > high).unwrap_or(w.outer.len() - 1);
-    let start = w.outer.iter().position(|p| p.y > low).unwrap_or(1).min(split);
-    let mut bottom = w.outer[..start].to_vec();
-    bottom.push(Vec2::new(r, low));
-    let mut top = vec![Vec2::new(r, high)];
-    top.extend(&w.outer[split..]);
-    let band = vec![Vec2::new(r, low), Vec2::new(r, high)];
-    let relief = (!labelled && s.chance(0.4)).then(|| (Relief::random(s), 1, [low, high], s.range(0.006, 0.015)));
-    let spans = [
-        Span { points: bottom, material: body },
-        Span { points: band, material: label },
-        Span { points: top, material: body },
-        Span { points: w.rim, material: body },
-        Span { points: w.inner, material: fill },
-    ];
-    let section = plain_section(s, 0.3);
-    a.add(turned(&spans, &section, relief), CREASE);
-    let z = h + shoulder + 0.08;
-    match s.count(0, 5) {
-        0 => {
-            // A candle: wax below the rim, and a wick.
-            let color = palette::color(&mut s.rng, Tone::Pastel);
-            let (wax, wick) = (s.plain(color), s.dark_plastic());
-            let [wax, wick] = [wax, wick].map(|m| a.material(m));
-            let level = s.range(0.5, 0.95) * h;
-            let inner = r.min(neck) - wall - 0.004;
-            let points = [
-                Vec2::new(0.0, 0.05),
-                Vec2::new(inner - 0.03, 0.05),
-                Vec2::new(inner, 0.1),
-                Vec2::new(inner, level),
-                Vec2::new(0.0, level),
-            ];
-            a.add(shapes::lathe(&[Span { points: points.to_vec(), material: wax }], 40, &section, 0.2), CREASE);
-            let path: Vec<Vec3> =
-                (0..5).map(|i| Vec3::new(0.01 * i as f32, 0.0, level - 0.02 + 0.03 * i as f32)).collect();
-            handles::wire(a, &path, 0.012, wick);
-        }
-        1 => {}
-        2 => lid(a, s, Vec2::new(neck + 0.02, z), [cap, cap]),
-        _ => crate::generate::packaging::screw_cap(a, s, neck * 1.06, z - 0.07, s_height(neck), cap),
-    }
-    if s.chance(0.12) {
-        let at = Vec2::new(neck, z - 0.02);
-        handles::bail(a, s, at, cap);
-    }
-}
-
-fn s_height(neck: f32) -> f32 {
-    0.1 + 0.18 * neck
 }
 
 /// Lamps and candlesticks: a turned foot and stem, a shade or a candle.

@@ -4,15 +4,21 @@
 
 mod error;
 mod load;
+mod material;
 pub mod noise;
 mod pattern;
 mod picture;
+mod raster;
+mod srgb;
 mod texture;
 mod triangles;
 
 pub use error::MeshError;
 pub use load::{LoadLimits, Loaded, MeshFormat, Up, load_mesh, load_mesh_bytes};
-pub use pattern::{Form, Frame, Pattern, Wear};
+pub use material::{AlphaMode, Material};
+pub use pattern::{Form, Frame, Pattern};
 pub use picture::{Map, Picture, Wrap};
-pub use texture::{AlphaMode, Material, Raster, Texture, linear_to_srgb, srgb_to_linear};
+pub use raster::Raster;
+pub use srgb::{linear_to_srgb, srgb_to_linear};
+pub use texture::{Texture, Wear};
 pub use triangles::Mesh;

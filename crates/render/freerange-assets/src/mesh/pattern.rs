@@ -1,11 +1,10 @@
-//! Textures of made things: woven and knitted strands, plaid, brushed metal, terrazzo, glaze, crumb, and dirt on top.
+//! Patterns of made things: woven and knitted strands, plaid, brushed metal, terrazzo, glaze, crumb.
 
 use std::f32::consts::TAU;
 
 use glam::{IVec3, Vec2, Vec3};
 
 use crate::mesh::noise;
-use crate::mesh::texture::Texture;
 
 /// Where the two coordinates of a flat pattern come from.
 #[derive(Clone, Copy, Debug)]
@@ -63,23 +62,73 @@ pub struct Pattern {
     pub seed: u32,
 }
 
-/// Stains, dust towards the foot, and scratches over another texture.
-#[derive(Clone, Debug)]
-pub struct Wear {
-    /// What is worn.
-    pub base: Texture,
-    /// Colour of the dirt.
-    pub dirt: Vec3,
-    /// Strength of stains, of the dirt near the foot, and of scratches, each 0 to 1.
-    pub amounts: Vec3,
-    /// Stains per unit.
-    pub scale: f32,
-    /// Noise seed.
-    pub seed: u32,
-}
-
 fn hash(x: f32, y: f32, seed: u32) -> f32 {
     noise::unit(noise::hash3(IVec3::new(x as i32, y as i32, 7), seed))
+}
+
+/// Strands over and under each other at `q`.
+fn weave(q: Vec2, [warp, weft, gap]: [Vec3; 3], float: i32, thin: f32, seed: u32) -> Vec3 {
+    let (cell, f) = (q.floor(), q - q.floor() - 0.5);
+    let period = (float + 1).max(2);
+    let up = (cell.x as i32 - cell.y as i32 * float.max(1)).rem_euclid(period) < float;
+    // The upper strand bulges across its width and dips where it goes under.
+    let strand = |across: f32, along: f32, color: Vec3, id: f32| {
+        let bulge = 1.0 - (2.0 * across / thin).powi(2);
+        let dip = 1.0 - 0.5 * (2.0 * along.abs()).powi(3);
+        let fibre = 0.9 + 0.2 * hash((across * 14.0).floor() + 31.0 * id, 0.0, seed);
+        let tone = 0.85 + 0.3 * hash(id, 5.0, seed);
+        (bulge > 0.0).then(|| color * ((0.45 + 0.55 * bulge.max(0.0).sqrt()) * dip * fibre * tone))
+    };
+    let over = if up { strand(f.x, f.y, warp, cell.x) } else { strand(f.y, f.x, weft, cell.y + 1000.0) };
+    let under = || if up { strand(f.y, 0.45, weft, cell.y + 1000.0) } else { strand(f.x, 0.45, warp, cell.x) };
+    over.or_else(|| under().map(|c| 0.7 * c)).unwrap_or(gap)
+}
+
+/// Crossing bands with a twill hatch at `q`.
+fn plaid(q: Vec2, colors: [Vec3; 3], hatch: f32, seed: u32) -> Vec3 {
+    let pick = |x: f32, salt: f32| {
+        let (i, f) = (x.floor(), x - x.floor());
+        // The same order of bands in every period of four cells.
+        let h = hash(i.rem_euclid(4.0), salt, seed);
+        if h > 0.75 && (f - 0.5).abs() < 0.12 {
+            colors[2]
+        } else if h > 0.45 {
+            colors[1]
+        } else {
+            colors[0]
+        }
+    };
+    let twill = ((q.x + q.y) * hatch).rem_euclid(1.0) < 0.5;
+    let (a, b) = (pick(q.x, 1.0), pick(q.y, 1.0));
+    if twill { a.lerp(b, 0.3) } else { a.lerp(b, 0.7) }
+}
+
+/// Glaze over clay at `p`.
+fn glazed(p: Vec3, glaze: Vec3, clay: Vec3, height: f32, run: f32, seed: u32) -> Vec3 {
+    let around = p.truncate().normalize_or_zero() * 5.0;
+    let border = height - run * noise::fbm(around.extend(0.0), seed, 3).powi(2);
+    let depth = p.z - border;
+    let speck = noise::value(p * 70.0, seed ^ 3) > 0.83;
+    if depth < 0.0 {
+        let tone = 0.85 + 0.3 * noise::fbm(p * 12.0, seed ^ 9, 3);
+        if speck { clay * 0.45 } else { clay * tone }
+    } else {
+        let pool = 1.0 - 0.35 * (1.0 - depth / 0.05).clamp(0.0, 1.0);
+        let streak = 0.88 + 0.24 * noise::fbm(Vec3::new(p.x * 26.0, p.y * 26.0, p.z * 2.5), seed, 2);
+        let speck = if speck { 0.7 } else { 1.0 };
+        glaze * (pool * streak * speck)
+    }
+}
+
+/// Chips of stone in a ground at `p`.
+fn terrazzo(p: Vec3, ground: Vec3, chips: [Vec3; 3], scale: f32, seed: u32) -> Vec3 {
+    let (d1, d2, id) = noise::worley(p * scale, seed);
+    let size = 0.25 + 0.5 * noise::unit(id ^ 0x55aa);
+    if d1 < size && d2 - d1 > 0.12 {
+        chips[id as usize % 3] * (0.85 + 0.3 * noise::unit(id.wrapping_mul(31)))
+    } else {
+        ground * (0.94 + 0.12 * noise::value(p * 60.0, seed))
+    }
 }
 
 impl Pattern {
@@ -88,23 +137,7 @@ impl Pattern {
         let seed = self.seed;
         let q = self.frame.coordinates(p, uv);
         let color = match &self.form {
-            Form::Weave { warp, weft, gap, float, thin } => {
-                let (cell, f) = (q.floor(), q - q.floor() - 0.5);
-                let period = (float + 1).max(2);
-                let up = (cell.x as i32 - cell.y as i32 * *float.max(&1)).rem_euclid(period) < *float;
-                // The upper strand bulges across its width and dips where it goes under.
-                let strand = |across: f32, along: f32, color: Vec3, id: f32| {
-                    let bulge = 1.0 - (2.0 * across / thin).powi(2);
-                    let dip = 1.0 - 0.5 * (2.0 * along.abs()).powi(3);
-                    let fibre = 0.9 + 0.2 * hash((across * 14.0).floor() + 31.0 * id, 0.0, seed);
-                    let tone = 0.85 + 0.3 * hash(id, 5.0, seed);
-                    (bulge > 0.0).then(|| color * ((0.45 + 0.55 * bulge.max(0.0).sqrt()) * dip * fibre * tone))
-                };
-                let over = if up { strand(f.x, f.y, *warp, cell.x) } else { strand(f.y, f.x, *weft, cell.y + 1000.0) };
-                let under =
-                    || if up { strand(f.y, 0.45, *weft, cell.y + 1000.0) } else { strand(f.x, 0.45, *warp, cell.x) };
-                over.or_else(|| under().map(|c| 0.7 * c)).unwrap_or(*gap)
-            }
+            Form::Weave { warp, weft, gap, float, thin } => weave(q, [*warp, *weft, *gap], *float, *thin, seed),
             Form::Knit { a, b, share } => {
                 let x = q.x - q.x.floor() - 0.5;
                 let y = q.y - 0.8 * x.abs();
@@ -114,23 +147,7 @@ impl Pattern {
                 let leg = Vec2::new((x.abs() - 0.25) * 3.2, v * 1.9).length();
                 color * (1.08 - 0.6 * leg.min(1.2).powi(2)) * (0.94 + 0.12 * hash(q.x.floor(), row, seed))
             }
-            Form::Plaid { colors, hatch } => {
-                let pick = |x: f32, salt: f32| {
-                    let (i, f) = (x.floor(), x - x.floor());
-                    // The same order of bands in every period of four cells.
-                    let h = hash(i.rem_euclid(4.0), salt, seed);
-                    if h > 0.75 && (f - 0.5).abs() < 0.12 {
-                        colors[2]
-                    } else if h > 0.45 {
-                        colors[1]
-                    } else {
-                        colors[0]
-                    }
-                };
-                let twill = ((q.x + q.y) * hatch).rem_euclid(1.0) < 0.5;
-                let (a, b) = (pick(q.x, 1.0), pick(q.y, 1.0));
-                if twill { a.lerp(b, 0.3) } else { a.lerp(b, 0.7) }
-            }
+            Form::Plaid { colors, hatch } => plaid(q, *colors, *hatch, seed),
             Form::Chevron { a, b, steep } => {
                 let x = (q.x - q.x.floor() - 0.5).abs();
                 let y = (q.y + steep * x).rem_euclid(1.0);
@@ -147,30 +164,8 @@ impl Pattern {
                 let line = stops.iter().any(|&s| (r - s).abs() < 0.006);
                 if line { colors[2] } else { colors[i % 2] }
             }
-            Form::Terrazzo { ground, chips, scale } => {
-                let (d1, d2, id) = noise::worley(p * *scale, seed);
-                let size = 0.25 + 0.5 * noise::unit(id ^ 0x55aa);
-                if d1 < size && d2 - d1 > 0.12 {
-                    chips[id as usize % 3] * (0.85 + 0.3 * noise::unit(id.wrapping_mul(31)))
-                } else {
-                    *ground * (0.94 + 0.12 * noise::value(p * 60.0, seed))
-                }
-            }
-            Form::Glaze { glaze, clay, height, run } => {
-                let around = p.truncate().normalize_or_zero() * 5.0;
-                let border = height - run * noise::fbm(around.extend(0.0), seed, 3).powi(2);
-                let depth = p.z - border;
-                let speck = noise::value(p * 70.0, seed ^ 3) > 0.83;
-                if depth < 0.0 {
-                    let tone = 0.85 + 0.3 * noise::fbm(p * 12.0, seed ^ 9, 3);
-                    if speck { *clay * 0.45 } else { *clay * tone }
-                } else {
-                    let pool = 1.0 - 0.35 * (1.0 - depth / 0.05).clamp(0.0, 1.0);
-                    let streak = 0.88 + 0.24 * noise::fbm(Vec3::new(p.x * 26.0, p.y * 26.0, p.z * 2.5), seed, 2);
-                    let speck = if speck { 0.7 } else { 1.0 };
-                    *glaze * (pool * streak * speck)
-                }
-            }
+            Form::Terrazzo { ground, chips, scale } => terrazzo(p, *ground, *chips, *scale, seed),
+            Form::Glaze { glaze, clay, height, run } => glazed(p, *glaze, *clay, *height, *run, seed),
             Form::Crumb { crust, crumb, scale } => {
                 let brown = noise::fbm(p * 4.0, seed, 3);
                 let base = crumb.lerp(*crust, ((brown - 0.35) * 2.2).clamp(0.0, 1.0));
@@ -183,28 +178,10 @@ impl Pattern {
     }
 }
 
-impl Wear {
-    /// Linear colour at rest position `p` and surface coordinates `uv`.
-    pub fn color(&self, p: Vec3, uv: Vec2) -> Vec3 {
-        let base = self.base.color(p, uv);
-        let stain = ((noise::fbm(p * self.scale, self.seed, 4) - 0.52) * 6.0).clamp(0.0, 1.0);
-        let low = (-0.1 - p.z).clamp(0.0, 0.4) * 2.5 * noise::value(p * 11.0, self.seed ^ 1);
-        let soil = (self.amounts.x * stain + self.amounts.y * low).clamp(0.0, 0.85);
-        let color = base.lerp(self.dirt, soil);
-        if self.amounts.z == 0.0 {
-            return color;
-        }
-        // Scratches: thin level lines of a stretched noise.
-        let n = noise::value(Vec3::new(p.x * 3.0 + p.z, p.y * 3.0 - p.z, p.z * 22.0), self.seed ^ 2);
-        let scratch = if (n - 0.5).abs() < 0.012 { self.amounts.z } else { 0.0 };
-        let pale = (1.5 * color + 0.08).min(Vec3::ONE);
-        color.lerp(pale, scratch).clamp(Vec3::ZERO, Vec3::ONE)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::mesh::texture::{Texture, Wear};
 
     fn samples(color: impl Fn(Vec3, Vec2) -> Vec3) -> Vec<Vec3> {
         (0..4000)

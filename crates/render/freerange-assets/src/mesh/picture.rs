@@ -5,7 +5,7 @@ use std::sync::{Arc, LazyLock};
 use glam::{Affine2, Vec2, Vec4};
 use image::RgbaImage;
 
-use crate::mesh::texture::{linear_to_srgb, srgb_to_linear};
+use crate::mesh::srgb::{linear_to_srgb, srgb_to_linear};
 
 static SRGB: LazyLock<[f32; 256]> = LazyLock::new(|| std::array::from_fn(|i| srgb_to_linear(i as f32 / 255.0)));
 static LINEAR: LazyLock<[f32; 256]> = LazyLock::new(|| std::array::from_fn(|i| i as f32 / 255.0));

@@ -1,94 +1,13 @@
-//! Materials and the textures that colour them.
+//! Textures: colors over surfaces.
 
-use std::sync::{Arc, LazyLock};
+use std::sync::Arc;
 
 use glam::{Vec2, Vec3, Vec4};
 
 use crate::mesh::noise;
-use crate::mesh::pattern::{Pattern, Wear};
+use crate::mesh::pattern::Pattern;
 use crate::mesh::picture::Map;
-
-/// Encodes one linear value as sRGB; clamps to [0, 1].
-pub fn linear_to_srgb(x: f32) -> f32 {
-    let x = x.clamp(0.0, 1.0);
-    if x <= 0.003_130_8 { 12.92 * x } else { 1.055 * x.powf(1.0 / 2.4) - 0.055 }
-}
-
-/// Decodes one sRGB value in [0, 1] to linear.
-pub fn srgb_to_linear(x: f32) -> f32 {
-    if x <= 0.040_45 { x / 12.92 } else { ((x + 0.055) / 1.055).powf(2.4) }
-}
-
-static DECODE: LazyLock<[f32; 256]> = LazyLock::new(|| std::array::from_fn(|i| srgb_to_linear(i as f32 / 255.0)));
-
-/// A small sRGB-encoded picture, row 0 at the top.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Raster {
-    width: usize,
-    height: usize,
-    pixels: Vec<[u8; 4]>,
-}
-
-impl Raster {
-    /// A picture of one colour (linear). Sides of zero become one.
-    pub fn new(width: usize, height: usize, fill: Vec3) -> Self {
-        let (width, height) = (width.max(1), height.max(1));
-        Self { width, height, pixels: vec![encode(fill); width * height] }
-    }
-
-    /// A picture of sRGB-encoded pixels, row 0 at the top. Both sides are at least 1.
-    pub fn from_encoded(width: usize, height: usize, pixels: Vec<[u8; 4]>) -> Self {
-        debug_assert_eq!(pixels.len(), width * height);
-        Self { width, height, pixels }
-    }
-
-    /// Width in pixels.
-    pub fn width(&self) -> usize {
-        self.width
-    }
-
-    /// Height in pixels.
-    pub fn height(&self) -> usize {
-        self.height
-    }
-
-    /// Sets a pixel to a linear colour; ignores points outside.
-    pub fn set(&mut self, x: i32, y: i32, color: Vec3) {
-        if x >= 0 && y >= 0 && (x as usize) < self.width && (y as usize) < self.height {
-            self.pixels[y as usize * self.width + x as usize] = encode(color);
-        }
-    }
-
-    /// Mean colour, linear.
-    pub fn mean(&self) -> Vec3 {
-        let decode = |e: u8| f64::from(DECODE[e as usize]);
-        let sum: glam::DVec3 =
-            self.pixels.iter().map(|&[r, g, b, _]| glam::DVec3::new(decode(r), decode(g), decode(b))).sum();
-        (sum / self.pixels.len() as f64).as_vec3()
-    }
-
-    /// Bilinear look-up in linear light; v points up, u wraps around, v is clamped.
-    pub fn sample(&self, uv: Vec2) -> Vec3 {
-        let x = uv.x.rem_euclid(1.0) * self.width as f32 - 0.5;
-        let y = ((1.0 - uv.y) * self.height as f32 - 0.5).clamp(0.0, (self.height - 1) as f32);
-        let (x0, y0) = (x.floor(), y.floor());
-        let (fx, fy) = (x - x0, y - y0);
-        let wrap = |x: i32| x.rem_euclid(self.width as i32) as usize;
-        let (x0, x1) = (wrap(x0 as i32), wrap(x0 as i32 + 1));
-        let y0 = y0 as usize;
-        let y1 = (y0 + 1).min(self.height - 1);
-        let at = |x: usize, y: usize| {
-            let [r, g, b, _] = self.pixels[y * self.width + x];
-            Vec3::new(DECODE[r as usize], DECODE[g as usize], DECODE[b as usize])
-        };
-        at(x0, y0).lerp(at(x1, y0), fx).lerp(at(x0, y1).lerp(at(x1, y1), fx), fy)
-    }
-}
-
-fn encode(c: Vec3) -> [u8; 4] {
-    let e = |x: f32| (linear_to_srgb(x) * 255.0 + 0.5) as u8;
-    [e(c.x), e(c.y), e(c.z), 255]
-}
+use crate::mesh::raster::Raster;
 
 /// A texture: linear colour as a function of the rest position `p` (within the sphere of radius 0.5) and of (u, v).
 /// Colours are linear and within [0, 1].
@@ -330,117 +249,36 @@ impl Texture {
     }
 }
 
-/// What the alpha of a surface means.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub enum AlphaMode {
-    /// Nothing: the surface is opaque.
-    #[default]
-    Opaque,
-    /// Where it is below the cutoff there is no surface; elsewhere it is opaque.
-    Mask {
-        /// Least alpha of the surface that is there.
-        cutoff: f32,
-    },
-    /// How much of what lies behind the surface hides.
-    Blend,
-}
-
-/// How a surface reflects light: a coloured base under a clear specular layer, or a metal.
+/// Stains, dust towards the foot, and scratches over another texture.
 #[derive(Clone, Debug)]
-pub struct Material {
-    /// Base colour.
-    pub texture: Texture,
-    /// Multiplied onto the base colour and its alpha; linear.
-    pub factor: Vec4,
-    /// What the alpha of the base colour means.
-    pub alpha: AlphaMode,
-    /// Amplitude of a slow brightness variation over the surface, 0 for none.
-    pub variation: f32,
-    /// Seed of that variation.
+pub struct Wear {
+    /// What is worn.
+    pub base: Texture,
+    /// Colour of the dirt.
+    pub dirt: Vec3,
+    /// Strength of stains, of the dirt near the foot, and of scratches, each 0 to 1.
+    pub amounts: Vec3,
+    /// Stains per unit.
+    pub scale: f32,
+    /// Noise seed.
     pub seed: u32,
-    /// Specular reflectance at normal incidence of the clear layer; 0.04 for most things, 0 for none.
-    pub specular: f32,
-    /// Roughness of the reflection, 0.1 (polished) to 1 (matt).
-    pub roughness: f32,
-    /// 1 for metals: the base colour tints the reflection and nothing is diffuse.
-    pub metallic: f32,
-    /// Linear values multiplied onto roughness (green) and metallic (blue), as in glTF.
-    pub metallic_roughness: Option<Map>,
-    /// Normals in tangent space as in glTF (x along u, y up in the picture, z outwards), with the scale of x and y.
-    pub normal_map: Option<(Map, f32)>,
-    /// Light that the surface gives off; linear radiance.
-    pub emission: Vec3,
-    /// Colours multiplied onto `emission`.
-    pub emission_map: Option<Map>,
-    /// Shows its base colour as it is, whatever the light.
-    pub unlit: bool,
 }
 
-impl Default for Material {
-    /// White and matt.
-    fn default() -> Self {
-        Self {
-            texture: Texture::Flat(Vec3::ONE),
-            factor: Vec4::ONE,
-            alpha: AlphaMode::Opaque,
-            variation: 0.0,
-            seed: 0,
-            specular: 0.0,
-            roughness: 1.0,
-            metallic: 0.0,
-            metallic_roughness: None,
-            normal_map: None,
-            emission: Vec3::ZERO,
-            emission_map: None,
-            unlit: false,
+impl Wear {
+    /// Linear colour at rest position `p` and surface coordinates `uv`.
+    pub fn color(&self, p: Vec3, uv: Vec2) -> Vec3 {
+        let base = self.base.color(p, uv);
+        let stain = ((noise::fbm(p * self.scale, self.seed, 4) - 0.52) * 6.0).clamp(0.0, 1.0);
+        let low = (-0.1 - p.z).clamp(0.0, 0.4) * 2.5 * noise::value(p * 11.0, self.seed ^ 1);
+        let soil = (self.amounts.x * stain + self.amounts.y * low).clamp(0.0, 0.85);
+        let color = base.lerp(self.dirt, soil);
+        if self.amounts.z == 0.0 {
+            return color;
         }
-    }
-}
-
-impl Material {
-    /// A matt material without a specular layer.
-    pub fn matt(texture: Texture) -> Self {
-        Self { texture, ..Self::default() }
-    }
-
-    /// Linear base colour at rest position `p` and surface coordinates `uv`, within [0, 1].
-    pub fn albedo(&self, p: Vec3, uv: Vec2) -> Vec3 {
-        self.rgba(p, uv, Vec4::ONE, 0.0).truncate()
-    }
-
-    /// Linear base colour and alpha at rest position `p` and surface coordinates `uv`, times `tint`, within [0, 1].
-    /// Pictures are averaged over about the length `footprint` in (u, v).
-    pub fn rgba(&self, p: Vec3, uv: Vec2, tint: Vec4, footprint: f32) -> Vec4 {
-        let mut color = self.texture.rgba(p, uv, footprint) * self.factor * tint;
-        if self.variation != 0.0 {
-            let n = noise::fbm(p * 7.0, self.seed, 2) - 0.5;
-            color = (color.truncate() * (1.0 + 2.0 * self.variation * n)).extend(color.w);
-        }
-        color.clamp(Vec4::ZERO, Vec4::ONE)
-    }
-
-    /// True if some property comes from a picture of a file.
-    pub fn has_pictures(&self) -> bool {
-        matches!(self.texture, Texture::Image(_))
-            || self.metallic_roughness.is_some()
-            || self.normal_map.is_some()
-            || self.emission_map.is_some()
-    }
-
-    /// Light given off at surface coordinates `uv`; linear. Pictures are averaged over about the length `footprint`.
-    pub fn emitted(&self, uv: Vec2, footprint: f32) -> Vec3 {
-        match &self.emission_map {
-            Some(map) if self.emission != Vec3::ZERO => self.emission * map.sample(uv, footprint).truncate(),
-            _ => self.emission,
-        }
-    }
-
-    /// How much of what lies behind a surface of that alpha is hidden, within [0, 1].
-    pub fn opacity(&self, alpha: f32) -> f32 {
-        match self.alpha {
-            AlphaMode::Opaque => 1.0,
-            AlphaMode::Mask { cutoff } => f32::from(u8::from(alpha >= cutoff)),
-            AlphaMode::Blend => alpha.clamp(0.0, 1.0),
-        }
+        // Scratches: thin level lines of a stretched noise.
+        let n = noise::value(Vec3::new(p.x * 3.0 + p.z, p.y * 3.0 - p.z, p.z * 22.0), self.seed ^ 2);
+        let scratch = if (n - 0.5).abs() < 0.012 { self.amounts.z } else { 0.0 };
+        let pale = (1.5 * color + 0.08).min(Vec3::ONE);
+        color.lerp(pale, scratch).clamp(Vec3::ZERO, Vec3::ONE)
     }
 }

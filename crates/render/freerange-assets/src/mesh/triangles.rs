@@ -3,7 +3,7 @@
 use glam::{Quat, Vec2, Vec3, Vec4};
 
 use crate::mesh::error::MeshError;
-use crate::mesh::texture::{AlphaMode, Material};
+use crate::mesh::material::{AlphaMode, Material};
 
 /// A triangle mesh with materials. Vertices are split where the surface has an edge or a texture seam.
 /// Triangles are counter-clockwise seen from outside.

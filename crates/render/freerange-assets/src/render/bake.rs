@@ -108,21 +108,9 @@ pub fn bake(mesh: &Mesh, tracer: &Tracer, lighting: &Lighting, config: &BakeConf
     }
 }
 
-/// Sends rays from every station.
-fn look_around(
-    mesh: &Mesh,
-    tracer: &Tracer,
-    lighting: &Lighting,
-    point_of: &[u32],
-    points: &[(Vec3, Vec3)],
-    solid: &[bool],
-) -> Stations {
-    let n = points.len();
-    let count = if mesh.solid { n } else { 2 * n };
-    let rays = lighting.rays.clamp(1, 512) as usize;
-    let mut s = Stations { rays, targets: vec![MISS; count * rays], buried: vec![false; count], sun: vec![0.0; count] };
-    // A station a little off its vertex, towards the middle of its triangles: in a corner it would otherwise lie in
-    // the plane of another wall.
+/// Towards the middle of each point's triangles, with their number, for a station a little off its vertex: in a corner it would
+/// otherwise lie in the plane of another wall. And whether all of them close a solid.
+fn inwards_of(mesh: &Mesh, point_of: &[u32], solid: &[bool], n: usize) -> (Vec<(Vec3, f32)>, Vec<bool>) {
     let mut inwards = vec![(Vec3::ZERO, 0.0); n];
     let mut closed = vec![true; n];
     if !mesh.solid {
@@ -137,6 +125,23 @@ fn look_around(
             }
         }
     }
+    (inwards, closed)
+}
+
+/// Sends rays from every station.
+fn look_around(
+    mesh: &Mesh,
+    tracer: &Tracer,
+    lighting: &Lighting,
+    point_of: &[u32],
+    points: &[(Vec3, Vec3)],
+    solid: &[bool],
+) -> Stations {
+    let n = points.len();
+    let count = if mesh.solid { n } else { 2 * n };
+    let rays = lighting.rays.clamp(1, 512) as usize;
+    let mut s = Stations { rays, targets: vec![MISS; count * rays], buried: vec![false; count], sun: vec![0.0; count] };
+    let (inwards, closed) = inwards_of(mesh, point_of, solid, n);
     for i in 0..count {
         let p = i % n;
         if i >= n && closed[p] {

@@ -18,7 +18,7 @@ mod project;
 #[cfg(all(test, any(feature = "cuda", feature = "metal", feature = "vulkan", feature = "webgpu")))]
 mod tests;
 
-use crate::{CHANNELS, op::Job};
+use crate::{CHANNELS, job::Job};
 use burn::backend::ops::FloatTensorOps;
 use burn::tensor::{DType, FloatDType, Shape};
 use burn_cubecl::{CubeBackend, kernel::into_contiguous, tensor::CubeTensor};
@@ -33,26 +33,6 @@ const TILE: usize = 16;
 const THREADS: usize = TILE * TILE;
 /// Bytes of a mask word, a float, an index.
 const WORD: usize = 4;
-
-/// How much of what to do at a time. Results are the same but for rounding; tests try all.
-#[derive(Clone, Copy, Debug)]
-pub struct Tuning {
-    /// Bytes that the buffers of one group of images may take: as many images as fit are drawn together, at least one.
-    /// Where there is more than one group, the backward pass prepares each again, instead of keeping all.
-    pub group_bytes: u64,
-    /// The largest number of keys that one cube sorts; a power of two.
-    pub sort_block: usize,
-    /// Whether floats are added atomically where the device can.
-    pub float_atomics: bool,
-    /// Most cubes along one axis of a grid, where the device does not set less.
-    pub grid_limit: u32,
-}
-
-impl Default for Tuning {
-    fn default() -> Self {
-        Self { group_bytes: 512 << 20, sort_block: 2048, float_atomics: true, grid_limit: u32::MAX }
-    }
-}
 
 /// What the forward pass leaves for the backward pass.
 pub struct State {

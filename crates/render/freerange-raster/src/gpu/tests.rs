@@ -3,12 +3,12 @@
 #[path = "../../tests/common/mod.rs"]
 mod common;
 
-use super::Tuning;
+use crate::job::{Job, Tuning};
 use crate::{RasterConfig, op};
 use burn::backend::Dispatch;
 use burn::tensor::{Device, Tensor, TensorData};
 use common::{WEIGHTS, assert_same, camera, floats, gpu, noise, on_cpu, scene, tensor};
-use op::{Job, RasterOps};
+use op::RasterOps;
 use std::sync::Arc;
 
 /// Image and gradient, as `on_cpu` returns them, of 3 objects from 2 views, through `tuning` and by the CPU.

@@ -137,7 +137,7 @@ mod tests {
 
     use super::*;
     use crate::mesh::load::LoadLimits;
-    use crate::mesh::texture::{Material, Texture};
+    use crate::mesh::{Material, Texture};
 
     fn triangle_soup(points: &[[f64; 3]], triangles: &[[u32; 3]]) -> Soup {
         let mut soup = Soup::default();

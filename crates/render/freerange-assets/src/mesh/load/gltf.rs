@@ -284,16 +284,8 @@ fn add_primitive(
     soup.check_room(job, name, used.len() as u64, corners.len() as u64 / 3)?;
 
     let material = materials.get(job, document, primitive.material, soup)?;
-    let optional = |job: &Job, semantic: Semantic, key: &str, widths: &[usize]| match attribute(semantic) {
-        None => Ok(None),
-        Some(index) => {
-            let accessor = open(job, document, name, key, index, widths)?;
-            if accessor.count < positions.count {
-                let expected = format!("as many values as there are positions ({})", positions.count);
-                return Err(job.error(format!("{name}.{key}"), expected, accessor.count));
-            }
-            Ok(Some(accessor))
-        }
+    let optional = |job: &Job, semantic: Semantic, key: &str, widths: &[usize]| {
+        open_optional(job, document, name, key, attribute(semantic), widths, positions.count)
     };
     let normals = optional(job, Semantic::Normals, "NORMAL", &[3])?;
     let colors = optional(job, Semantic::Colors(0), "COLOR_0", &[3, 4])?;
@@ -354,6 +346,25 @@ fn open<'a>(
     let accessor = document.accessor(job, &name, index)?;
     accessor.expect_kind(job, &name, widths)?;
     Ok(accessor)
+}
+
+/// An attribute that may be missing, of values for `count` positions.
+fn open_optional<'a>(
+    job: &Job,
+    document: &'a Document,
+    name: &str,
+    key: &str,
+    index: Option<Index<json::Accessor>>,
+    widths: &[usize],
+    count: usize,
+) -> Result<Option<Accessor<'a>>, MeshError> {
+    let Some(index) = index else { return Ok(None) };
+    let accessor = open(job, document, name, key, index, widths)?;
+    if accessor.count < count {
+        let expected = format!("as many values as there are positions ({count})");
+        return Err(job.error(format!("{name}.{key}"), expected, accessor.count));
+    }
+    Ok(Some(accessor))
 }
 
 /// The matrix that takes normals along: the transposed inverse times the determinant, defined for singular ones too.

@@ -14,8 +14,9 @@ use super::accessor::Document;
 use super::job::{Job, Soup};
 use super::picture::decode;
 use crate::mesh::error::MeshError;
+use crate::mesh::material::{AlphaMode, Material};
 use crate::mesh::picture::{Map, Picture, Wrap};
-use crate::mesh::texture::{AlphaMode, Material, Texture};
+use crate::mesh::texture::Texture;
 
 /// A material of the mesh, and the texture coordinates that its pictures need.
 #[derive(Clone, Copy)]

@@ -9,7 +9,7 @@ use super::{LoadLimits, read_at_most};
 use freerange_util::IoError;
 
 use crate::mesh::error::MeshError;
-use crate::mesh::texture::Material;
+use crate::mesh::material::Material;
 
 /// Notes beyond this many are dropped: a file must not fill the memory with them.
 const MAX_NOTES: usize = 64;

@@ -10,6 +10,7 @@ mod job;
 mod normals;
 mod obj;
 mod obj_material;
+mod obj_text;
 
 mod picture;
 mod ply;

@@ -3,7 +3,6 @@
 //! Parsing is `tobj`'s. What it would stumble over (indices out of range, colours or normals of some vertices only,
 //! encodings other than UTF-8) is found before, line by line, together with the counts that the limits are about.
 
-use std::borrow::Cow;
 use std::collections::{BTreeMap, HashMap};
 use std::io::Cursor;
 use std::path::Path;
@@ -12,8 +11,9 @@ use glam::{DVec3, Vec2, Vec3, Vec4};
 
 use super::job::{Job, Soup};
 use super::obj_material::{Library, default_material, read_library};
+use super::obj_text::{split, statements};
 use crate::mesh::error::MeshError;
-use crate::mesh::texture::srgb_to_linear;
+use crate::mesh::srgb::srgb_to_linear;
 
 /// Reads a file and its material libraries into triangles in the file's frame. Polygons become fans. Vertex colours are
 /// taken as sRGB, as the programs that write this extension do; v is flipped to run down.
@@ -54,28 +54,6 @@ struct Counts {
     corners_with_normal: usize,
     /// In order, each once.
     libraries: Vec<String>,
-}
-
-/// The statements of a file: lines, joined where one ends in a backslash.
-pub fn statements(text: &str) -> impl Iterator<Item = Cow<'_, str>> {
-    let mut lines = text.lines();
-    std::iter::from_fn(move || {
-        let mut line = Cow::Borrowed(lines.next()?.trim());
-        while line.ends_with('\\') && !line.starts_with('#') {
-            let line = line.to_mut();
-            line.pop();
-            line.push(' ');
-            line.push_str(lines.next().unwrap_or_default().trim());
-        }
-        Some(line)
-    })
-}
-
-/// A statement's key word and the rest; of statements that cannot contain names, without a comment at the end.
-pub fn split(statement: &str) -> (&str, &str) {
-    let (key, rest) = statement.split_once(char::is_whitespace).unwrap_or((statement, ""));
-    let rest = if matches!(key, "v" | "vt" | "vn" | "f") { rest.split('#').next().unwrap_or_default() } else { rest };
-    (key, rest.trim())
 }
 
 fn count(job: &mut Job, text: &str) -> Result<Counts, MeshError> {

@@ -7,11 +7,12 @@ use glam::{Affine2, Vec2, Vec3, Vec4};
 use image::RgbaImage;
 
 use super::job::Job;
-use super::obj::{split, statements};
+use super::obj_text::{split, statements};
 use super::picture::decode;
 use crate::mesh::error::MeshError;
+use crate::mesh::material::{AlphaMode, Material};
 use crate::mesh::picture::{Map, Picture, Wrap};
-use crate::mesh::texture::{AlphaMode, Material, Texture};
+use crate::mesh::texture::Texture;
 
 /// A material library: its text, with the statements that matter and are well formed, and the folder its textures are
 /// relative to.

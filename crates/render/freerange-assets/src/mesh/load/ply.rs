@@ -13,8 +13,10 @@ use ply_rs_bw::ply::{
 use super::job::{Job, Soup};
 use super::picture::decode;
 use crate::mesh::error::MeshError;
+use crate::mesh::material::Material;
 use crate::mesh::picture::{Map, Picture};
-use crate::mesh::texture::{Material, Texture, srgb_to_linear};
+use crate::mesh::srgb::srgb_to_linear;
+use crate::mesh::texture::Texture;
 
 /// A header is short; this bounds the memory for its parsed form.
 const MAX_HEADER: usize = 1 << 20;
