@@ -1,3 +1,5 @@
+//! The fused block against its readable version.
+
 use burn::{
     module::{Module, ModuleVisitor, Param},
     tensor::{Device, Gradients, Tensor},

@@ -1,3 +1,5 @@
+//! Checkpoints written, read, and refused.
+
 use std::path::Path;
 
 use burn::{

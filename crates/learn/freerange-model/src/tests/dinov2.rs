@@ -1,3 +1,5 @@
+//! DINOv2 against golden values, and broken weights.
+
 use burn::{
     module::Module,
     tensor::{Device, Tensor},

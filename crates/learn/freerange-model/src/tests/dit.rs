@@ -1,3 +1,5 @@
+//! The diffusion transformer against golden values.
+
 use burn::{
     module::{Module, ModuleVisitor, Param},
     tensor::{Device, Gradients, Tensor, TensorData},

@@ -1,3 +1,5 @@
+//! Image tokens: features, position, color and ray of each patch.
+
 use burn::tensor::{Device, Tensor, TensorData};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;

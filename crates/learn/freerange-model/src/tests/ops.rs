@@ -1,3 +1,5 @@
+//! The fused operations against their readable versions.
+
 use burn::tensor::{Device, FloatDType, Gradients, Tensor, TensorData};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;

@@ -1,3 +1,5 @@
+//! Steps against Burn's AdamW, and states that go on.
+
 use burn::{
     optim::{AdamWConfig, GradientsParams},
     tensor::Gradients,

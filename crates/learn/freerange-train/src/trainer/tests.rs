@@ -1,3 +1,5 @@
+//! Whole runs: they go on as if never stopped, whatever stops them, and refuse what they cannot use.
+
 use std::{
     io::{Seek, SeekFrom, Write},
     path::Path,

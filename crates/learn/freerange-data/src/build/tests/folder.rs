@@ -1,3 +1,5 @@
+//! Folders of shards in the making: interrupted, shared, taken up again, merged.
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};

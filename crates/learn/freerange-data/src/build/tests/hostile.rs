@@ -1,3 +1,5 @@
+//! Shards and records that nobody has checked.
+
 use std::path::{Path, PathBuf};
 
 use freerange_gaussians::channel;

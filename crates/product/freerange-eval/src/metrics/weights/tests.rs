@@ -1,3 +1,5 @@
+//! Weights of networks: read, converted, refused.
+
 use super::*;
 
 #[test]

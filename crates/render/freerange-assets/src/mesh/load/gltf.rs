@@ -300,14 +300,7 @@ fn add_primitive(
         }
     };
 
-    let pose = match joints {
-        None => None,
-        Some(joints) => Pose::skinned(job, document, name, primitive, positions.count, joints)?,
-    };
-    if pose.is_some() {
-        job.note("skins are applied in the pose of the file's nodes");
-    }
-    let pose = pose.unwrap_or(Pose::Rigid(world_from_node));
+    let pose = pose_of(job, document, name, primitive, positions.count, world_from_node, joints)?;
     // A mirror turns triangles inside out. Joints that mirror do so alike.
     let mirrored = pose.at(job, name, used[0] as usize)?.matrix3.determinant() < 0.0;
     let base = soup.positions.len() as u32;
@@ -346,6 +339,26 @@ fn open<'a>(
     let accessor = document.accessor(job, &name, index)?;
     accessor.expect_kind(job, &name, widths)?;
     Ok(accessor)
+}
+
+/// How vertices come into the world: with their node, or with the joints of a skin.
+fn pose_of<'a>(
+    job: &mut Job,
+    document: &'a Document,
+    name: &str,
+    primitive: &Primitive,
+    count: usize,
+    world_from_node: DAffine3,
+    joints: Option<Arc<Vec<DAffine3>>>,
+) -> Result<Pose<'a>, MeshError> {
+    let pose = match joints {
+        None => None,
+        Some(joints) => Pose::skinned(job, document, name, primitive, count, joints)?,
+    };
+    if pose.is_some() {
+        job.note("skins are applied in the pose of the file's nodes");
+    }
+    Ok(pose.unwrap_or(Pose::Rigid(world_from_node)))
 }
 
 /// An attribute that may be missing, of values for `count` positions.

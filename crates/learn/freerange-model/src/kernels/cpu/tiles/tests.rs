@@ -1,3 +1,5 @@
+//! Products and attention on tiles against the same in f64 or f32.
+
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 

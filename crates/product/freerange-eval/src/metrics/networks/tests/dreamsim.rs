@@ -1,3 +1,5 @@
+//! Distances against the DreamSim package's.
+
 use std::path::Path;
 
 use freerange_vectors::{json, json_at};

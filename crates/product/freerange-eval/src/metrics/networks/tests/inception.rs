@@ -1,3 +1,5 @@
+//! Features against pytorch-fid's.
+
 use super::{Random, Vectors, close, device, golden, image};
 use crate::metrics::networks::{Inception, inception_features, resize::Image8};
 

@@ -1,3 +1,5 @@
+//! Distances against the LPIPS package's.
+
 use std::{collections::HashMap, path::PathBuf};
 
 use burn::tensor::Tensor;

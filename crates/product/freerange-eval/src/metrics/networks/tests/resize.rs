@@ -1,3 +1,5 @@
+//! Resizing against Pillow's and Hugging Face's.
+
 use super::{Vectors, close, golden, image};
 use crate::metrics::networks::{dino, resize::Image8};
 
