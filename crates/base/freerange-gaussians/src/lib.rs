@@ -1,8 +1,6 @@
 //! Clouds of 3D Gaussians: the 14 channels, their normalisation, the level-of-detail tree, and files.
 //!
-//! This crate knows nothing of tensors, images or cameras: everything downstream builds on it.
-//!
-//! Architecture invariant: no tensors, no images, no cameras.
+//! Architecture invariant: no tensors, no photos, no cameras. Of the workspace it uses `freerange-util` alone.
 
 mod align;
 mod cloud;
@@ -34,3 +32,7 @@ pub use ply_columns::SCALE_OF_NONE;
 pub use ply_file::PlyFile;
 pub use splats::{RenderMode, Splats};
 pub use tree::{LodTree, Node};
+
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

@@ -26,3 +26,7 @@ pub use load::{LoadConfig, Loaded, MaskKind, MaskSource, cut, files, load, up_of
 pub use mask_model::{MaskModel, PixelRange};
 pub use open::{Scene, SceneConfig, views_to_compare};
 pub use write::write_colmap;
+
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

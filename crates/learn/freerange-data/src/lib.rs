@@ -1,10 +1,10 @@
-//! Training objects: what one is, how many are stored and streamed.
+//! Training objects: what one is, how it is made, how many are stored and streamed.
 //!
 //! An object is its posed views and its Gaussians at the depths of the level-of-detail tree that training needs.
-//! [`Shards`] reads a folder of them as a stream. How objects are made is `freerange-data`'s; here, a folder only says
-//! so ([`Recipe`]).
+//! [`Shards`] reads a folder of them as a stream; [`build`] makes them of meshes or seeds. What reads them need not know how
+//! they were made: a folder says so ([`Recipe`]), and training asks whoever makes them ([`Making`]).
 //!
-//! Architecture invariant: no network.
+//! Architecture invariant: no neural network, no tensors.
 
 pub mod build;
 mod error;

@@ -3,7 +3,8 @@
 //! Start with [`sample::FlowSampler`] (Sections 3.3 and 3.6 of the paper); [`sample::Refiner`] is the network refinement
 //! of the shipped model.
 //!
-//! Architecture invariant: no training objects, no files but what a checkpoint says of its use ([`settings`]).
+//! Architecture invariant: no training objects, no meshes, no files. What a checkpoint says of its use comes as values
+//! ([`settings`]).
 
 pub mod conditioning;
 pub mod coupling;

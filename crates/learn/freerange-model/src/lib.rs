@@ -1,7 +1,7 @@
 //! The network: image encoders, the diffusion transformer, checkpoints.
 //!
 //! [`FreeRange`] is the whole network as one module; [`Checkpoint`] is a trained one with everything that sampling
-//! needs. This crate knows nothing of losses or data.
+//! needs.
 //!
 //! Architecture invariant: no losses, no data, no renders.
 

@@ -4,7 +4,7 @@
 //! Apart from the training it serves, so that another MPI library does not compile that again. Without its features
 //! there is nothing here.
 //!
-//! Architecture invariant: what is summed is not known here.
+//! Architecture invariant: of the workspace it uses `freerange-train` alone; what is summed is not known here.
 
 #[cfg(feature = "mpi")]
 mod mpi;

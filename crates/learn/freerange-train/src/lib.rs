@@ -2,7 +2,7 @@
 //!
 //! Start with [`train::step`] (Section 3 of the paper) and [`trainer::Trainer`].
 //!
-//! Architecture invariant: no meshes here; objects come from a stream, whoever makes them.
+//! Architecture invariant: no meshes; objects come from a stream, whoever makes them.
 
 pub mod batch;
 pub mod config;

@@ -7,9 +7,9 @@
 //! * [`psnr_over_white`]: how well Gaussians show what views show.
 //! * [`refine`]: the same from a cloud that is already good, held where no view looks.
 //!
-//! Plain Rust over the rasteriser's CPU functions; no tensor library.
+//! Plain Rust over the rasterizer's CPU functions.
 //!
-//! Architecture invariant: no network.
+//! Architecture invariant: no neural network, no tensors, no source meshes.
 
 mod adam;
 mod axis;

@@ -7,7 +7,7 @@
 //! become paths of ours: they name files below a job's own folder, after they were taken apart. `Host` and `Origin` are checked, so that
 //! pages of other sites cannot use a browser to get here, and beyond loopback nobody is served without a token.
 //!
-//! Architecture invariant: no tensors and no network: the engine behind the page is a trait.
+//! Architecture invariant: no tensors and no neural network: the engine behind the page is a trait ([`Engine`]).
 
 #![deny(missing_docs)]
 

@@ -42,6 +42,8 @@
 //!
 //! # Features
 //! `embedded` (default) has the shipped checkpoint in the library, 40 MB. `cuda`, `metal`, `vulkan`, `webgpu`: see [`Device`].
+//!
+//! Architecture invariant: no training and no training objects; reads scenes and checkpoints, and prints nothing.
 #![deny(missing_docs)]
 
 mod checkpoint;

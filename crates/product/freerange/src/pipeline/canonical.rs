@@ -10,7 +10,7 @@ use freerange_scene::camera::{Similarity, View, Window};
 use freerange_util::Note;
 
 use super::watch::Watch;
-use crate::{Detect, Error, Options, Stage, choose_views, to_canonical};
+use crate::{Detect, Error, Options, Stage, choose_views, error::Lift, to_canonical};
 
 /// The views of an object in the canonical frame.
 pub(crate) struct CanonicalScene {
