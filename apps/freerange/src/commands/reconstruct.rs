@@ -22,7 +22,8 @@ use freerange_scene::camera::{
     FrameConfig, canonical_from_user,
     image_ops::{sheet, to_picture},
 };
-use freerange_util::Note;
+use freerange_scene::views_to_compare;
+use freerange_util::{Note, NoteKind};
 use serde::Serialize;
 
 use crate::{

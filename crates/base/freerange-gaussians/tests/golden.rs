@@ -1,6 +1,6 @@
 //! Against vectors of independent references: `tests/golden/lod` and `tests/golden/flow`.
 
-use freerange_gaussians::{Alignment, Cloud, Gaussian, LodTree, Normalization, merge, patch};
+use freerange_gaussians::{Alignment, Cloud, Gaussian, LodTree, Normalization, merge};
 use freerange_vectors::Vectors;
 use glam::{DMat3, DQuat, DVec3};
 
@@ -167,7 +167,7 @@ fn frames_below_a_shared_root_are_the_published_ones() {
 }
 
 #[test]
-fn normalisation_and_patches() {
+fn normalization() {
     let golden = Golden::open("flow/fm");
     let array = |name: &str| <[f32; 14]>::try_from(golden.f32(name)).unwrap();
     let normalization = Normalization::new(array("in/mean"), array("in/std")).unwrap();
@@ -180,12 +180,4 @@ fn normalisation_and_patches() {
     };
     assert!(near(normalization.denormalize(&z1).rows(), golden.f32("out/z1_denormalised")));
     assert!(near(&normalization.normalize(&Cloud::from_rows(z1.clone())), golden.f32("out/z1_normalised")));
-
-    let expected = golden.f32("out/patchified_z1"); // [7, 3, 28]
-    for (sample, expected) in z1.chunks(6 * 14).zip(expected.chunks(3 * 28)) {
-        assert_eq!(patch::shape(6, 14, 2).unwrap(), [3, 28]);
-        for (token, expected) in patch::patchify(sample, 14, 2).unwrap().zip(expected.chunks(28)) {
-            assert_eq!(token, expected);
-        }
-    }
 }

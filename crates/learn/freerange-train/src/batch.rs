@@ -6,11 +6,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use freerange_data::{InputFit, Object};
 use freerange_gaussians::{Cloud, Normalization, channel};
 use freerange_model::ModelConfig;
-use freerange_scene::camera::{
-    Similarity, View, Window,
-    image_ops::{resize_area, shrunk_size, to_f32_rgba},
-    plucker,
-};
+use freerange_scene::camera::{Similarity, View};
 use glam::DVec3;
 use rand::{Rng, SeedableRng, seq::SliceRandom};
 use rand_chacha::ChaCha8Rng;

@@ -1,7 +1,7 @@
 //! Fits of small scenes that the rasteriser itself has drawn, and what all tests share.
 
-use crate::views::Targets;
 use crate::*;
+use crate::{quick::polish, views::Targets};
 use freerange_gaussians::{Cloud, channel};
 use freerange_raster::{RasterConfig, render};
 use freerange_scene::camera::{Camera, View};

@@ -207,7 +207,6 @@ impl Beneath for FlowError {
             Self::Cancelled => Error::Cancelled,
             Self::Device { .. } => Error::DeviceFailed(self.to_string()),
             Self::Config(e) => e.lift(),
-            Self::Io(e) => e.lift(),
             Self::Fit(e) => e.lift(),
             Self::Model(e) => e.lift(),
             Self::Raster(e) => e.lift(),
@@ -253,7 +252,7 @@ impl Beneath for RasterError {
 }
 
 /// Images that cannot be compared.
-impl Beneath for MetricsError {
+impl Beneath for ImageError {
     fn lift(self) -> Error {
         Error::Scene(Cause::of(self))
     }

@@ -4,8 +4,8 @@ use freerange::{Cloud, View};
 use freerange_gaussians::Splats;
 use freerange_gaussians::formats::{Format, Frame, WriteOptions};
 use freerange_optim::meshing::{MeshConfig, MeshFormat, mesh_of, save};
-use freerange_scene::{views_to_compare, write_colmap};
-use freerange_util::{Note, NoteKind};
+use freerange_scene::write_colmap;
+use freerange_util::Note;
 
 use crate::{error::CliError, output::OutputFolder};
 

@@ -17,7 +17,7 @@ use crate::{Checkpoint, Dinov2, EncoderConfig, FreeRange, ModelConfig, PatchConf
 fn config() -> ModelConfig {
     ModelConfig {
         image_size: 8,
-        encoder: EncoderConfig::Patch(PatchConfig { patch_size: 4, channels: 4, patch_hidden: 6 }),
+        encoder: EncoderConfig::Patch(PatchConfig { patch_size: 4, channels: 4 }),
         hidden: 16,
         blocks: 2,
         heads: 2,

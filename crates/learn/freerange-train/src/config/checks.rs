@@ -79,19 +79,19 @@ impl<M: Making> TrainConfig<M> {
     fn check_refinement(&self, loss: RefinementLoss) -> Result<(), Invalid> {
         let RefinementLoss { share, render_weight } = loss;
         check((0.0..=1.0).contains(&share), "loss.refinement.share", "0 to 1", share.to_string())?;
-            check(
-                render_weight.is_finite() && render_weight >= 0.0,
-                "loss.refinement.render_weight",
-                "a finite number, 0 or more",
-                render_weight.to_string(),
-            )?;
-            check(
+        check(
+            render_weight.is_finite() && render_weight >= 0.0,
+            "loss.refinement.render_weight",
+            "a finite number, 0 or more",
+            render_weight.to_string(),
+        )?;
+        check(
             !self.loss.random_patches,
             "loss.random_patches",
-                "false with loss.refinement, whose fits are in the tree's order",
-                "true".into(),
-            )?;
-            let made = self.data.shards.is_some() || self.data.making.input_fits() > 0;
+            "false with loss.refinement, whose fits are in the tree's order",
+            "true".into(),
+        )?;
+        let made = self.data.shards.is_some() || self.data.making.input_fits() > 0;
         check(made, "data.object.input_fits", "at least 1 with loss.refinement", "0".into())
     }
 
