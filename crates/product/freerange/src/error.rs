@@ -284,7 +284,7 @@ mod tests {
 
     #[test]
     fn causes_lead_on() {
-        let cause = serde_json::from_str::<()>("{").unwrap_err();
+        let cause = serde_json::from_str::<serde_json::Value>("{").unwrap_err();
         let error = CameraError::Json { file: "a.json".into(), source: cause }.lift();
         assert!(matches!(error, Error::Scene(_)) && !error.is_failure());
         assert!(!error.to_string().contains("EOF") && error.source().unwrap().to_string().contains("EOF"));
