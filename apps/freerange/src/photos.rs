@@ -40,8 +40,8 @@ pub struct Photos {
     images: Option<PathBuf>,
     /// Source of masks: a folder, alpha, plain (one background color) or estimate [default: auto].
     ///
-    /// A folder has NAME.png, the object in white. auto takes the first of mask files, alpha, a plain background, and an estimate
-    /// from poses and colors.
+    /// A folder has NAME.png, the object in white. With auto: the first of mask files, alpha, a plain background, and an
+    /// estimate from poses and colors.
     #[arg(long, value_name = "WHERE", value_parser = parse_masks)]
     masks: Option<MaskSource>,
     /// Masks from a segmentation network, an ONNX file such as u2netp.onnx.

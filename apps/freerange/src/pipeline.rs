@@ -70,7 +70,7 @@ pub struct PipelineArgs {
     pub device: DeviceName,
     /// Up axis of the scene: auto, z, y, cameras (tops of the photos), or a direction X,Y,Z.
     ///
-    /// auto: +z where the format of the cameras defines it. Otherwise the table below the object, or the cameras.
+    /// With auto: +z where the cameras' format defines it, else from the table below the object or the cameras.
     #[arg(long, default_value = "auto", allow_hyphen_values = true, help_heading = "Photos and cameras")]
     pub up: UpChoice,
 }
