@@ -107,7 +107,7 @@ fn crates_lie_in_layers() {
         for crate_ in *names {
             let apart = KEPT_APART.iter().find(|(c, _)| c == crate_).map_or(&[][..], |(_, apart)| apart);
             for (used, _) in dependencies(&crates.join(layer).join(crate_).join("Cargo.toml")) {
-                if used.starts_with("freerange") && used != "freerange-vectors" {
+                if used.starts_with("freerange") {
                     assert!(below.contains(&used.as_str()), "{crate_} must not use {used}, which is not below it");
                     assert!(!apart.contains(&used.as_str()), "{crate_} must not use {used}");
                 }
