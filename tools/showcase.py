@@ -8,7 +8,7 @@ SCENE/transforms_full.json -o RESULT/out` and `freerange render RESULT/out/gauss
 --compare: labeled columns instead: inputs, the baseline fit, the result, the ground truth (docs/images/comparison.jpg);
 writes OUT.jpg. RESULT/out was made with --eval-scene
 SCENE/transforms_val.json; RESULT/fit holds what `freerange render RESULT/fit.ply --cameras SCENE/transforms_val.json -o RESULT/fit`
-wrote of the baseline: `cargo run --release -p freerange --example baseline -- SCENE/transforms_full.json RESULT/fit.ply`.
+wrote of the baseline: `cargo run --release -p freerange-cli --example baseline -- SCENE/transforms_full.json RESULT/fit.ply`.
 """
 import json
 import pathlib

@@ -1,6 +1,6 @@
 //! The baseline of docs/results.md as a file: 3DGS-MCMC on the input views alone, as `freerange eval --method fit` runs it.
 //!
-//! `cargo run --release -p freerange --example baseline -- SCENE OUT.ply [PIXELS]`
+//! `cargo run --release -p freerange-cli --example baseline -- SCENE OUT.ply [PIXELS]`
 
 use std::{error::Error, ops::ControlFlow, path::Path};
 
