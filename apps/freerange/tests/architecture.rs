@@ -6,7 +6,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-/// The layers, bottom to top, and the crates of each. A crate uses those listed before it.
+/// The layers in order, and the crates of each. A crate uses those listed before it.
 const LAYERS: &[(&str, &[&str])] = &[
     ("base", &["freerange-util", "freerange-gaussians"]),
     ("capture", &["freerange-scene"]),

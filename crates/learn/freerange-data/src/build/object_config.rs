@@ -34,7 +34,7 @@ pub struct ObjectConfig {
     pub input_fits: usize,
     /// Settings of these initial fits.
     pub quick_fit: QuickFitConfig,
-    /// Optimization steps on all views that make the refined target of each initial fit.
+    /// Optimization steps on all views that make the target of each initial fit.
     pub mend: usize,
     /// How the axes of the Gaussians in the tree are labeled.
     pub alignment: Alignment,

@@ -51,7 +51,7 @@ pub struct LossConfig {
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RefinementLoss {
-    /// Share of the batches that do; the others start from pure noise, with views drawn anew.
+    /// Share of the batches that do; the others start from pure noise, with views of their own.
     pub share: f32,
     /// Weight of the rendering losses in them.
     pub render_weight: f32,

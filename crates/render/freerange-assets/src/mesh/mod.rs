@@ -1,6 +1,6 @@
 //! Textured triangle meshes: files in ([`load_mesh`]), materials and the textures that colour them.
 //!
-//! What is drawn of a mesh is `freerange-assets`'s, where meshes come from without files `freerange-assets`'s.
+//! What is drawn of a mesh is `render`'s, where meshes come from without files `generate`'s.
 
 mod error;
 mod load;
