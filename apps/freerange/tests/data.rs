@@ -58,8 +58,20 @@ fn write_pyramid(path: &Path) {
 }
 
 /// A fast build: few views of few pixels, and no fit.
-const FAST: [&str; 10] =
-    ["--gaussians", "surface", "--views", "4", "--resolution", "32", "--depths", "3,6", "--min-psnr", "0"];
+const FAST: [&str; 12] = [
+    "--gaussians",
+    "surface",
+    "--views",
+    "4",
+    "--resolution",
+    "32",
+    "--depths",
+    "3,6",
+    "--min-psnr",
+    "0",
+    "--fits",
+    "0",
+];
 
 fn with<'a>(first: &[&'a str], rest: &[&'a str]) -> Vec<&'a str> {
     [first, rest].concat()

@@ -140,7 +140,8 @@ impl Scorer {
                     Metric::Psnr => capped_psnr(a, b)?,
                     Metric::SsimCropped => ssim_skimage_gauss(a, b, width, height)?,
                     Metric::SsimSample => ssim_skimage_sample(a, b, width, height)?,
-                    _ => ssim_3dgs(a, b, width, height)?,
+                    Metric::Ssim => ssim_3dgs(a, b, width, height)?,
+                    of_network => unreachable!("{of_network} is no metric of pixels"),
                 })
             };
             self.pixel

@@ -26,7 +26,7 @@ impl Reconstructor {
     /// If the device fails.
     #[cfg(feature = "embedded")]
     pub fn shipped(device: &Device) -> Result<Self, Error> {
-        crate::internal::shipped(device)
+        Ok(Self::new(load_checkpoint(None, &EncoderPlaces::default(), device)?, device))
     }
 
     /// A model from a file. The weights of a frozen encoder are looked for in `encoders`.

@@ -71,7 +71,7 @@ impl InputArgs {
 }
 
 /// How objects are made and stored.
-#[derive(clap::Args)]
+#[derive(Clone, Debug, clap::Args)]
 pub struct Settings {
     /// Configuration whose table `data` is used: tiny, base, paper, or a file.
     #[arg(long, default_value = "tiny")]
@@ -124,6 +124,14 @@ enum Source {
 }
 
 impl Settings {
+    /// The configuration of a command that makes no initial fits.
+    pub fn without_input_fits(&self, default_source: Option<GaussianSource>) -> Result<BuildConfig, CliError> {
+        if self.fits.is_some() {
+            return Err(CliError::input("--fits: this command makes no initial fits"));
+        }
+        Self { fits: Some(0), ..self.clone() }.build_config(default_source)
+    }
+
     /// The configuration with what the arguments change. `default_source` where neither says where Gaussians come from.
     pub fn build_config(&self, default_source: Option<GaussianSource>) -> Result<BuildConfig, CliError> {
         let mut config = build_config(&TrainConfig::load(&self.config)?);

@@ -27,7 +27,7 @@ pub struct Args {
 
 pub fn run(args: &Args) -> Result<(), CliError> {
     let items = args.input.items()?.spread(args.objects.unwrap_or(u64::MAX));
-    let config = args.settings.build_config(Some(GaussianSource::Fit))?;
+    let config = args.settings.without_input_fits(Some(GaussianSource::Fit))?;
     let mut bar = Progress::new("measuring", items.len());
     let mut table: Vec<Quality> = Vec::new();
     let mut lines = String::new();

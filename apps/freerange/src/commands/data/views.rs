@@ -22,7 +22,7 @@ pub struct Args {
 
 pub fn run(args: &Args) -> Result<(), CliError> {
     let items = args.input.items()?;
-    let config = args.settings.build_config(None)?;
+    let config = args.settings.without_input_fits(None)?;
     let single = !args.input.path().is_dir() && items.len() == 1;
     let mut bar = Progress::new("rendering", items.len());
     for index in 0..items.len() {
