@@ -16,8 +16,10 @@ use freerange::{
     read_gaussians, score,
 };
 use freerange_eval::memory::peak_memory;
-use freerange_gaussians::formats::Frame;
-use freerange_gaussians::{Splats, write_ply_at};
+use freerange_gaussians::{
+    Splats,
+    formats::{Frame, WriteOptions},
+};
 use freerange_scene::camera::{
     FrameConfig, canonical_from_user,
     image_ops::{sheet, to_picture},
@@ -335,8 +337,9 @@ fn write_sample(
 ) -> Result<SampleReport, CliError> {
     let suffix = if i == 0 { String::new() } else { format!("-{i}") };
     let file = format!("gaussians{suffix}.ply");
-    write_ply_at(&sample.gaussians, origin, &output.path(&file)?)?;
     let splats = Splats { origin: origin.unwrap_or_default().into(), ..sample.gaussians.clone().into() };
+    let options = WriteOptions { frame, ..WriteOptions::default() };
+    freerange_gaussians::formats::write(&splats, &output.path(&file)?, &options)?;
     let place = Place { output, suffix: &suffix, frame, origin: origin.unwrap_or_default() };
     notes.extend(place.write(&splats, formats, inputs)?);
     write_turntable(&output.path(&format!("turntable{suffix}.gif"))?, &sample.canonical, 48, 256)?;

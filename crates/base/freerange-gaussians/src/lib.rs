@@ -27,7 +27,7 @@ pub use error::SplatError;
 pub use harmonics::{Harmonics, MAX_DEGREE, coefficients};
 pub use merge::{Gaussian, OPACITY_RANGE, merge};
 pub use normalize::{Normalization, STD_FLOOR, Statistics};
-pub use ply::{encode_ply, encode_splats, parse_ply, read_ply, write_ply, write_ply_at};
+pub use ply::{encode_ply, encode_splats, parse_ply, read_ply, write_ply};
 pub use ply_columns::SCALE_OF_NONE;
 pub use ply_file::PlyFile;
 pub use splats::{RenderMode, Splats};

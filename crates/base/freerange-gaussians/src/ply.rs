@@ -169,17 +169,6 @@ pub fn write_ply(cloud: &Cloud, file: &Path) -> Result<(), SplatError> {
     Ok(write_atomically(file, |w| write_to(cloud, w)).map_err(IoError::at(file))?)
 }
 
-/// As [`write_ply`], with a comment that says what positions are relative to where they would be too large for 32 bits.
-///
-/// # Errors
-/// As [`write_ply`].
-pub fn write_ply_at(cloud: &Cloud, origin: Option<[f64; 3]>, file: &Path) -> Result<(), SplatError> {
-    cloud.check_finite()?;
-    let comments: Vec<String> = origin.map(|origin| origin_comment(origin.into())).into_iter().collect();
-    let written = write_atomically(file, |w| write_all(cloud, &Harmonics::default(), &comments, w));
-    Ok(written.map_err(IoError::at(file))?)
-}
-
 fn origin_comment(origin: DVec3) -> String {
     format!("Origin: {}", origin.to_array().map(|v| v.to_string()).join(" "))
 }

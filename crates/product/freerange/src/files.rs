@@ -2,8 +2,10 @@
 
 use std::path::Path;
 
-use freerange_gaussians::formats::{Format, Frame, WriteOptions, read, write};
-use freerange_gaussians::{Cloud, write_ply};
+use freerange_gaussians::{
+    Cloud,
+    formats::{Frame, WriteOptions, read, write},
+};
 use freerange_util::Note;
 use glam::DVec3;
 
@@ -25,17 +27,13 @@ pub fn read_gaussians(path: &Path, up: DVec3) -> Result<(Cloud, Vec<Note>), Erro
     Ok((loaded.splats.into_cloud(), notes))
 }
 
-/// Writes Gaussians in whose frame `up` is up; the notes say what the format could not hold. `.ply` is written as the
-/// program writes it, in the Gaussians' own frame.
+/// Writes Gaussians in whose frame `up` is up; the notes say what the format could not hold. `.ply` keeps the Gaussians' own
+/// frame, and says in a comment which way is up.
 ///
 /// # Errors
 /// Names the file, or the extension that no format has.
 pub fn write_gaussians(gaussians: &Cloud, path: &Path, up: DVec3) -> Result<Vec<Note>, Error> {
     let options = WriteOptions { frame: frame(up)?, ..WriteOptions::default() };
-    if Format::of(path).lift()? == Format::Ply {
-        write_ply(gaussians, path).lift()?;
-        return Ok(Vec::new());
-    }
     let lost = write(&gaussians.clone().into(), path, &options).lift()?;
     Ok(lost.into_iter().map(Note::dropped).collect())
 }
@@ -46,7 +44,7 @@ fn frame(up: DVec3) -> Result<Frame, Error> {
 
 #[cfg(test)]
 mod tests {
-    use freerange_gaussians::channel;
+    use freerange_gaussians::{channel, formats::Frames};
 
     use super::*;
 
@@ -65,6 +63,11 @@ mod tests {
             let near = |i: usize| (0..4).any(|j| same.mean(i).distance(cloud.mean(j)) < 1e-3);
             assert!(same.len() == 4 && (0..4).all(near), "{name}: {:?}", (0..4).map(apart).collect::<Vec<_>>());
         }
+        // Whoever reads a `.ply` without knowing learns which way is up, however the scene lies.
+        let up = DVec3::new(0.3, -0.9, 0.2).normalize();
+        write_gaussians(&cloud, &folder.join("b.ply"), up).unwrap();
+        let loaded = read(&folder.join("b.ply"), Frames::default()).unwrap();
+        assert!(loaded.frame.up().distance(up) < 1e-8 && loaded.splats.cloud.rows() == cloud.rows());
         let of = |name: &str, up| write_gaussians(&cloud, &folder.join(name), up).unwrap_err();
         assert!(matches!(of("a.ply", DVec3::ZERO), Error::Input { field, .. } if field == "up"));
         assert!(matches!(of("a.txt", DVec3::Z), Error::Gaussians(_)));
