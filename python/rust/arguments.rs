@@ -53,8 +53,8 @@ pub fn raw_camera(camera: &Camera) -> RawCamera {
     let Camera { width, height, fx, fy, cx, cy, world_to_camera } = *camera;
     // A rotation is undone by its transpose.
     let axes = DMat3::from_mat4(world_to_camera).transpose();
-    let centre = camera.center();
-    let row = |i: usize| [axes.x_axis[i], axes.y_axis[i], axes.z_axis[i], centre[i]];
+    let center = camera.center();
+    let row = |i: usize| [axes.x_axis[i], axes.y_axis[i], axes.z_axis[i], center[i]];
     (width, height, [fx, fy, cx, cy], [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]])
 }
 

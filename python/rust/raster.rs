@@ -1,4 +1,4 @@
-//! The rasteriser: forward, backward, and the slow one that tests compare with.
+//! The rasterizer: forward, backward, and the slow one that tests compare with.
 
 use freerange::Camera;
 use freerange_raster::{RasterConfig, RenderOutput, reference as slow, render, render_backward};
@@ -68,7 +68,7 @@ impl Rendered {
     }
 }
 
-/// One view by the rasteriser's slow, obvious form in double precision: colour and alpha. For tests.
+/// One view by the rasterizer's slow, obvious form in double precision: color and alpha. For tests.
 #[pyfunction]
 pub fn reference(
     py: Python<'_>,

@@ -2,7 +2,9 @@
 
 use std::path::PathBuf;
 
-use freerange::{CameraFormat, Cloud, Hints, LoadConfig, MaskSource, Note, ReadConfig, SceneConfig, Turntable, View};
+use freerange::{
+    CameraFormat, Gaussians, Hints, LoadConfig, MaskSource, Note, ReadConfig, SceneConfig, Turntable, View,
+};
 use glam::DVec3;
 use pyo3::{prelude::*, pybacked::PyBackedBytes, types::PyByteArray};
 
@@ -116,10 +118,10 @@ pub fn read_gaussians(py: Python<'_>, path: PathBuf, up: [f64; 3]) -> PyResult<(
     Ok((bytes(py, cloud.rows()), texts(notes)))
 }
 
-fn cloud(rows: &[u8]) -> PyResult<Cloud> {
+fn cloud(rows: &[u8]) -> PyResult<Gaussians> {
     let rows = floats("gaussians", rows)?;
     match rows.len() % freerange_raster::CHANNELS {
-        0 => Ok(Cloud::from_rows(rows)),
+        0 => Ok(Gaussians::from_rows(rows)),
         _ => Err(refuse("gaussians", "rows of 14 numbers", format!("{} numbers", rows.len()))),
     }
 }

@@ -8,7 +8,7 @@ pub struct Signals;
 #[cfg(unix)]
 impl Signals {
     fn set() -> libc::sigset_t {
-        // SAFETY: both calls initialise or change this set alone.
+        // SAFETY: both calls initialize or change this set alone.
         unsafe {
             let mut set = std::mem::zeroed();
             libc::sigemptyset(&mut set);
@@ -20,7 +20,7 @@ impl Signals {
 
     /// To be called before there are other threads, which take over what is set here.
     pub fn take() -> Self {
-        // SAFETY: the set is initialised.
+        // SAFETY: the set is initialized.
         unsafe {
             libc::pthread_sigmask(libc::SIG_BLOCK, &Self::set(), std::ptr::null_mut());
         }
@@ -34,7 +34,7 @@ impl Signals {
     pub fn on_first(self, begin_to_end: impl FnOnce() + Send + 'static) -> Result<(), CliError> {
         let wait = || {
             let mut signal = 0;
-            // SAFETY: both places are ours and initialised.
+            // SAFETY: both places are ours and initialized.
             unsafe { libc::sigwait(&Self::set(), &mut signal) };
             signal
         };

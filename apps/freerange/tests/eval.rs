@@ -6,7 +6,7 @@ use std::{
     process::{Command, Output},
 };
 
-use freerange_gaussians::{Cloud, write_ply};
+use freerange_gaussians::{Gaussians, write_ply};
 use freerange_raster::{RasterConfig, render};
 use freerange_scene::camera::{Camera, image_ops::composite, transforms_json};
 use glam::DVec3;
@@ -30,12 +30,14 @@ fn expect(code: i32, args: &[&str]) -> String {
 }
 
 /// A red ball with a green bump.
-fn cloud() -> Cloud {
+fn cloud() -> Gaussians {
     let ball = |at: [f32; 3], size: f32, color: [f32; 3]| {
         let s = size.ln();
         [&at[..], &[s, s, s], &[1.0, 0.0, 0.0, 0.0], &[4.0], &color].concat()
     };
-    Cloud::from_rows([ball([0.0; 3], 0.12, [0.8, 0.1, 0.1]), ball([0.2, 0.1, 0.15], 0.06, [0.1, 0.7, 0.2])].concat())
+    Gaussians::from_rows(
+        [ball([0.0; 3], 0.12, [0.8, 0.1, 0.1]), ball([0.2, 0.1, 0.15], 0.06, [0.1, 0.7, 0.2])].concat(),
+    )
 }
 
 /// A picture of the ball with straight alpha, from renders over black and over white.

@@ -7,7 +7,7 @@ use std::{
 };
 
 use freerange_gaussians::formats::{Frame, read};
-use freerange_gaussians::{Cloud, channel, write_ply};
+use freerange_gaussians::{Gaussians, channel, write_ply};
 use glam::DVec3;
 
 fn freerange(args: &[&str]) -> Output {
@@ -19,9 +19,9 @@ fn example() -> String {
 }
 
 /// Ten Gaussians on a curve without symmetry, as a file in a folder of its own.
-fn object() -> (tempfile::TempDir, PathBuf, Cloud) {
+fn object() -> (tempfile::TempDir, PathBuf, Gaussians) {
     let folder = tempfile::tempdir().unwrap();
-    let mut cloud = Cloud::default();
+    let mut cloud = Gaussians::default();
     for i in 0..10 {
         let t = i as f32 / 10.0;
         let mut row = [0.0; channel::COUNT];

@@ -10,7 +10,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use freerange::{Choices, Cloud, Detect, Device, Options, Reconstruction, Reconstructor, Scene};
+use freerange::{Choices, Detect, Device, Gaussians, Options, Reconstruction, Reconstructor, Scene};
 use serde_json::Value;
 
 fn bowl() -> PathBuf {
@@ -122,7 +122,7 @@ fn the_page_gives_what_the_library_gives() {
     let rows: Vec<f32> = rows.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
 
     let (_, made) = of_library();
-    let expected: &Cloud = &made.samples[0].gaussians;
+    let expected: &Gaussians = &made.samples[0].gaussians;
     // The server keeps results in a file, in which colors are rounded.
     assert_eq!(rows.len(), expected.rows().len());
     let worst = rows.iter().zip(expected.rows()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);

@@ -11,7 +11,7 @@ use std::{
 };
 
 use freerange::{
-    Cloud, PipelineConfig, Reconstructor, SETTINGS_SCHEMA, Scene, Scores, Stage, View,
+    Gaussians, PipelineConfig, Reconstructor, SETTINGS_SCHEMA, Scene, Scores, Stage, View,
     pictures::{on_white, render_view, write_turntable},
     read_gaussians, score,
 };
@@ -240,7 +240,7 @@ fn run_in(args: &Args, job: &Job) -> Result<(), CliError> {
 }
 
 /// The Gaussians of a file, in the frame of the views.
-fn init(file: &Path, views: &[View], config: &FrameConfig) -> Result<Cloud, CliError> {
+fn init(file: &Path, views: &[View], config: &FrameConfig) -> Result<Gaussians, CliError> {
     // The canonical frame has +z up.
     let up = canonical_from_user(views, config)?.canonical_from_user.rotation.inverse() * glam::DVec3::Z;
     let (cloud, notes) = read_gaussians(file, up)?;
@@ -369,7 +369,7 @@ fn in_scene(from_local: &freerange::Similarity, origin: Option<[f64; 3]>) -> fre
 }
 
 /// Each input image beside its render.
-fn comparisons(cloud: &freerange::Cloud, views: &[View]) -> Result<Vec<(String, image::RgbaImage)>, CliError> {
+fn comparisons(cloud: &freerange::Gaussians, views: &[View]) -> Result<Vec<(String, image::RgbaImage)>, CliError> {
     views
         .iter()
         .map(|view| {

@@ -3,7 +3,7 @@
 use std::{net::IpAddr, ops::ControlFlow, path::PathBuf, process::Command, sync::Arc, time::Duration};
 
 use freerange::{
-    Camera, Cloud, Detect, Init, Quality, Reconstructor, View, choose_views, internal::others_show,
+    Camera, Detect, Gaussians, Init, Quality, Reconstructor, View, choose_views, internal::others_show,
     pictures::render_view,
 };
 use freerange_scene::camera::image_ops::to_picture;
@@ -218,7 +218,7 @@ impl Engine for Local {
         })
     }
 
-    fn picture(&self, cloud: &Cloud, camera: &Camera) -> Result<RgbaImage, String> {
+    fn picture(&self, cloud: &Gaussians, camera: &Camera) -> Result<RgbaImage, String> {
         let rgb = render_view(cloud, camera).map_err(|e| e.to_string())?;
         Ok(to_picture(&rgb, camera.width, camera.height))
     }

@@ -1,6 +1,6 @@
 //! How long the level-of-detail tree takes: `cargo run --release -p freerange-gaussians --example tree_speed`.
 
-use freerange_gaussians::{Alignment, Cloud, LodTree};
+use freerange_gaussians::{Alignment, Gaussians, LodTree};
 use rand::{Rng, SeedableRng};
 use std::time::Instant;
 
@@ -9,7 +9,7 @@ fn main() {
     for leaves in [2048, 4096, 8192, 16384] {
         let row =
             |rng: &mut rand_chacha::ChaCha8Rng| std::array::from_fn::<f32, 14, _>(|_| rng.random_range(-1.0..1.0));
-        let cloud = Cloud::from_rows((0..leaves).flat_map(|_| row(&mut rng)).collect());
+        let cloud = Gaussians::from_rows((0..leaves).flat_map(|_| row(&mut rng)).collect());
         for alignment in [Alignment::None, Alignment::Identity, Alignment::Parent] {
             let mut best = [f64::INFINITY; 2];
             for _ in 0..20 {

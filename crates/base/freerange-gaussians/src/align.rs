@@ -19,7 +19,7 @@ pub enum Alignment {
     None,
 }
 
-/// Of the 24 proper labellings of `axes` the one with the largest `sum_j axes_j . reference_j`, and `scale` in its order.
+/// Of the 24 proper labelings of `axes` the one with the largest `sum_j axes_j . reference_j`, and `scale` in its order.
 pub(crate) fn relabel(axes: DMat3, scale: DVec3, reference: DMat3) -> (DMat3, DVec3) {
     // dots.col(j)[p]: how well axis p agrees with the reference's axis j.
     let dots = axes.transpose() * reference;
@@ -47,7 +47,7 @@ pub(crate) fn relabel(axes: DMat3, scale: DVec3, reference: DMat3) -> (DMat3, DV
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cloud::covariance;
+    use crate::gaussians::covariance;
     use glam::DQuat;
     use proptest::prelude::*;
 

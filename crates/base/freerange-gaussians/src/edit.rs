@@ -137,14 +137,14 @@ impl Cells {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Cloud, channel};
+    use crate::{Gaussians, channel};
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 
     /// Gaussians on a sphere about `center`.
-    fn ball(n: usize, center: DVec3, radius: f64, scale: f64, seed: u64) -> Cloud {
+    fn ball(n: usize, center: DVec3, radius: f64, scale: f64, seed: u64) -> Gaussians {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let mut cloud = Cloud::default();
+        let mut cloud = Gaussians::default();
         for _ in 0..n {
             let d = DVec3::from_array(std::array::from_fn(|_| rng.random_range(-1.0..1.0)));
             let p = center + radius * d.normalize();

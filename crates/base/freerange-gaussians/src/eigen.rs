@@ -52,7 +52,7 @@ pub(crate) fn symmetric_eigen(matrix: &DMat3) -> (DVec3, DMat3) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cloud::covariance;
+    use crate::gaussians::covariance;
     use glam::DQuat;
     use proptest::prelude::*;
 

@@ -83,8 +83,8 @@ pub enum SplatError {
         /// What was asked for.
         found: usize,
     },
-    /// Normalisation statistics that cannot be used.
-    #[error("normalisation, channel {channel} ({name}), {field}: expected {expected}, found {found}")]
+    /// Normalization statistics that cannot be used.
+    #[error("normalization, channel {channel} ({name}), {field}: expected {expected}, found {found}")]
     Normalization {
         /// `mean` or `std`.
         field: &'static str,

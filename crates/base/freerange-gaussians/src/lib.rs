@@ -1,13 +1,13 @@
-//! Clouds of 3D Gaussians: the 14 channels, their normalisation, the level-of-detail tree, and files.
+//! Clouds of 3D Gaussians: the 14 channels, their normalization, the level-of-detail tree, and files.
 //!
 //! Architecture invariant: no tensors, no photos, no cameras. Of the workspace it uses `freerange-util` alone.
 
 mod align;
-mod cloud;
 mod edit;
 mod eigen;
 mod error;
 pub mod formats;
+mod gaussians;
 mod harmonics;
 mod merge;
 mod normalize;
@@ -22,8 +22,8 @@ mod splats;
 mod tree;
 
 pub use align::Alignment;
-pub use cloud::{Cloud, channel};
 pub use error::SplatError;
+pub use gaussians::{Gaussians, channel};
 pub use harmonics::{Harmonics, MAX_DEGREE, coefficients};
 pub use merge::{Gaussian, OPACITY_RANGE, merge};
 pub use normalize::{Normalization, STD_FLOOR, Statistics};

@@ -1,13 +1,13 @@
 //! One Gaussian in plain (linear) parameters; merging several into one and splitting one into two.
 
-use crate::cloud::{self, Row};
 use crate::eigen::symmetric_eigen;
-use crate::{Cloud, SplatError, channel};
+use crate::gaussians::{self, Row};
+use crate::{Gaussians, SplatError, channel};
 use glam::{DMat3, DQuat, DVec3};
 use std::{cmp::Reverse, collections::BinaryHeap, f64::consts::FRAC_2_PI};
 
 /// Opacities of the rows that a tree gives out are clamped to this range, so that their logit lies within +-6.91.
-/// Merged opacities may exceed 1. The rasteriser draws neither less than 1/255 nor more than 0.99 of a Gaussian.
+/// Merged opacities may exceed 1. The rasterizer draws neither less than 1/255 nor more than 0.99 of a Gaussian.
 pub const OPACITY_RANGE: [f64; 2] = [0.001, 0.999];
 
 /// Log-scales that can be merged: beyond it squares of squares leave the range of f64.
@@ -16,7 +16,7 @@ const LOG_SCALES: std::ops::RangeInclusive<f64> = -40.0..=40.0;
 /// A Gaussian in linear parameters, f64.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Gaussian {
-    /// Centre, in world units.
+    /// Center, in world units.
     pub mean: DVec3,
     /// World-space covariance.
     pub covariance: DMat3,
@@ -26,21 +26,21 @@ pub struct Gaussian {
     pub axes: DMat3,
     /// Opacity; of a merged Gaussian it may exceed 1.
     pub opacity: f64,
-    /// Colour, sRGB-encoded.
+    /// Color, sRGB-encoded.
     pub color: DVec3,
 }
 
 impl Gaussian {
     /// From its parameters; `rotation` need not have unit length, and stands for the identity where it is zero.
     pub fn new(mean: DVec3, scale: DVec3, rotation: DQuat, opacity: f64, color: DVec3) -> Self {
-        let axes = DMat3::from_quat(cloud::unit(rotation));
-        Self { mean, covariance: cloud::covariance(axes, scale), scale, axes, opacity, color }
+        let axes = DMat3::from_quat(gaussians::unit(rotation));
+        Self { mean, covariance: gaussians::covariance(axes, scale), scale, axes, opacity, color }
     }
 
     /// From the 14 channels of a cloud's row.
     pub fn from_row(row: &[f32; channel::COUNT]) -> Self {
-        let (mean, scale, color) = (cloud::mean(row), cloud::scale(row), cloud::color(row));
-        Self::new(mean, scale, cloud::rotation(row), cloud::opacity(row), color)
+        let (mean, scale, color) = (gaussians::mean(row), gaussians::scale(row), gaussians::color(row));
+        Self::new(mean, scale, gaussians::rotation(row), gaussians::opacity(row), color)
     }
 
     /// The 14 channels: quaternion of unit length with w >= 0, opacity clamped to [`OPACITY_RANGE`].
@@ -49,7 +49,7 @@ impl Gaussian {
         let opacity = self.opacity.clamp(OPACITY_RANGE[0], OPACITY_RANGE[1]);
         row[channel::MEAN].copy_from_slice(&self.mean.as_vec3().to_array());
         row[channel::LOG_SCALE].copy_from_slice(&self.scale.to_array().map(|s| s.ln() as f32));
-        cloud::set_rotation(&mut row, cloud::canonical(DQuat::from_mat3(&self.axes).normalize()));
+        gaussians::set_rotation(&mut row, gaussians::canonical(DQuat::from_mat3(&self.axes).normalize()));
         row[channel::LOGIT_OPACITY] = (opacity / (1.0 - opacity)).ln() as f32;
         row[channel::COLOR].copy_from_slice(&self.color.as_vec3().to_array());
         row
@@ -60,8 +60,8 @@ impl Gaussian {
         self.opacity * surface(self.scale)
     }
 
-    /// The two halves on either side of the centre, across the longest axis, each as the Gaussian of its moments
-    /// (a half-normal: centre `s sqrt(2 / pi)` away, variance `s^2 (1 - 2 / pi)`). Their merge gives the whole back.
+    /// The two halves on either side of the center, across the longest axis, each as the Gaussian of its moments
+    /// (a half-normal: center `s sqrt(2 / pi)` away, variance `s^2 (1 - 2 / pi)`). Their merge gives the whole back.
     pub fn halves(&self) -> [Self; 2] {
         let longest = (1..3).fold(0, |best, k| if self.scale[k] > self.scale[best] { k } else { best });
         let mut scale = self.scale;
@@ -70,7 +70,7 @@ impl Gaussian {
         let opacity = self.weight() / (2.0 * surface(scale));
         [-shift, shift].map(|shift| Self {
             mean: self.mean + shift,
-            covariance: cloud::covariance(self.axes, scale),
+            covariance: gaussians::covariance(self.axes, scale),
             scale,
             opacity,
             ..self.clone()
@@ -106,7 +106,7 @@ impl Gaussian {
 }
 
 /// The Gaussians of `cloud`, checked to be fit for merging.
-pub(crate) fn gaussians(cloud: &Cloud) -> Result<Vec<Gaussian>, SplatError> {
+pub(crate) fn gaussians(cloud: &Gaussians) -> Result<Vec<Gaussian>, SplatError> {
     cloud.check_finite()?;
     cloud.iter().map(Gaussian::from_row).enumerate().map(|(i, g)| g.check(i).map(|()| g)).collect()
 }

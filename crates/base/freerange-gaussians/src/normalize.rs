@@ -1,13 +1,13 @@
-//! Per-channel normalisation, and the streaming statistics it comes from.
+//! Per-channel normalization, and the streaming statistics it comes from.
 
-use crate::{Cloud, SplatError, channel};
+use crate::{Gaussians, SplatError, channel};
 
 /// Smallest standard deviation a channel is divided by: one that varies less counts as constant, and must not blow
 /// rounding errors up.
 pub const STD_FLOOR: f32 = 1e-4;
 
 /// Mean and standard deviation of every channel over the training set; travels inside checkpoints.
-/// Deserialising refuses values that cannot be divided by.
+/// Deserializing refuses values that cannot be divided by.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(try_from = "Unchecked")]
 pub struct Normalization {
@@ -57,8 +57,8 @@ impl Normalization {
         Ok(Self { mean, std })
     }
 
-    /// Normalised channels, `(x - mean) / std`, row-major `[n, 14]`.
-    pub fn normalize(&self, cloud: &Cloud) -> Vec<f32> {
+    /// Normalized channels, `(x - mean) / std`, row-major `[n, 14]`.
+    pub fn normalize(&self, cloud: &Gaussians) -> Vec<f32> {
         let mut rows = cloud.rows().to_vec();
         for row in rows.as_chunks_mut::<{ channel::COUNT }>().0 {
             for c in 0..channel::COUNT {
@@ -68,13 +68,13 @@ impl Normalization {
         rows
     }
 
-    /// The cloud of normalised channels, `z * std + mean`; `rows` is row-major `[n, 14]`. Quaternions come out as they
-    /// are: see [`Cloud::canonicalize_rotations`].
+    /// The cloud of normalized channels, `z * std + mean`; `rows` is row-major `[n, 14]`. Quaternions come out as they
+    /// are: see [`Gaussians::canonicalize_rotations`].
     ///
     /// # Panics
     /// If the length of `rows` is no multiple of 14.
-    pub fn denormalize(&self, rows: &[f32]) -> Cloud {
-        let mut cloud = Cloud::from_rows(rows.to_vec());
+    pub fn denormalize(&self, rows: &[f32]) -> Gaussians {
+        let mut cloud = Gaussians::from_rows(rows.to_vec());
         for row in cloud.iter_mut() {
             for c in 0..channel::COUNT {
                 row[c] = row[c] * self.std[c] + self.mean[c];
@@ -104,7 +104,7 @@ impl Statistics {
     ///
     /// # Errors
     /// [`SplatError::Value`] where a channel is not finite; nothing is added then.
-    pub fn add(&mut self, cloud: &Cloud) -> Result<(), SplatError> {
+    pub fn add(&mut self, cloud: &Gaussians) -> Result<(), SplatError> {
         cloud.check_finite()?;
         for row in cloud {
             self.count += 1;
@@ -151,8 +151,8 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    fn cloud(values: &[f32]) -> Cloud {
-        Cloud::from_rows(values[..values.len() / channel::COUNT * channel::COUNT].to_vec())
+    fn cloud(values: &[f32]) -> Gaussians {
+        Gaussians::from_rows(values[..values.len() / channel::COUNT * channel::COUNT].to_vec())
     }
 
     proptest! {
@@ -184,7 +184,7 @@ mod tests {
     fn far_from_zero_the_variance_survives() {
         let values: Vec<f32> = (0..1000).flat_map(|i| [1e6 + (i % 2) as f32; channel::COUNT]).collect();
         let mut s = Statistics::default();
-        s.add(&Cloud::from_rows(values)).unwrap();
+        s.add(&Gaussians::from_rows(values)).unwrap();
         assert!((s.normalization().unwrap().std[0] - 0.5).abs() < 1e-6);
     }
 
@@ -192,12 +192,12 @@ mod tests {
     fn constant_channels_and_bad_input() {
         let mut s = Statistics::default();
         assert!(matches!(s.normalization(), Err(SplatError::Empty)));
-        s.add(&Cloud::from_rows(vec![3.0; 5 * channel::COUNT])).unwrap();
+        s.add(&Gaussians::from_rows(vec![3.0; 5 * channel::COUNT])).unwrap();
         let n = s.normalization().unwrap();
         assert_eq!((n.mean[4], n.std[4]), (3.0, STD_FLOOR));
-        assert!(n.normalize(&Cloud::from_rows(vec![3.0; channel::COUNT])).iter().all(|v| *v == 0.0));
+        assert!(n.normalize(&Gaussians::from_rows(vec![3.0; channel::COUNT])).iter().all(|v| *v == 0.0));
         let before = s.clone();
-        assert!(s.add(&Cloud::from_rows(vec![f32::INFINITY; channel::COUNT])).is_err());
+        assert!(s.add(&Gaussians::from_rows(vec![f32::INFINITY; channel::COUNT])).is_err());
         assert_eq!(s, before);
         assert!(Normalization::new([0.0; 14], [0.0; 14]).is_err());
         assert!(Normalization::new([f32::NAN; 14], [1.0; 14]).is_err());

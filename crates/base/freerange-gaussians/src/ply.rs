@@ -13,7 +13,7 @@ use crate::ply_error::{listed, property_error, value_error};
 use crate::ply_file::PlyFile;
 use crate::ply_header::{Element, read_header};
 use crate::ply_values::Values;
-use crate::{Cloud, Harmonics, RenderMode, SplatError, Splats, channel, coefficients};
+use crate::{Gaussians, Harmonics, RenderMode, SplatError, Splats, channel, coefficients};
 use freerange_util::{IoError, write_atomically};
 use glam::DVec3;
 use std::io::{self, BufRead, BufReader, Write};
@@ -56,7 +56,7 @@ pub fn parse_ply(mut reader: impl BufRead, file: &Path) -> Result<PlyFile, Splat
         values.rows(element, |_, _, _| Ok(()))?;
     }
     let mut rows = read_rows(&mut values, vertex, &plan)?;
-    let cloud = Cloud::from_rows(std::mem::take(&mut rows.data));
+    let cloud = Gaussians::from_rows(std::mem::take(&mut rows.data));
     if cloud.is_empty() && rows.dropped > 0 {
         return Err(value_error(file, vertex, 0, "x", "at least one Gaussian of finite numbers", "none"));
     }
@@ -160,11 +160,11 @@ fn finite_value(c: usize, value: f64) -> Option<f32> {
 }
 
 /// Writes `cloud` to a `.ply` file, first beside it and then renamed. The same cloud gives the same bytes. Reading it
-/// back gives the same values in all channels but colour, which is rounded once.
+/// back gives the same values in all channels but color, which is rounded once.
 ///
 /// # Errors
 /// [`SplatError::Io`]; [`SplatError::Value`] where a channel is not finite.
-pub fn write_ply(cloud: &Cloud, file: &Path) -> Result<(), SplatError> {
+pub fn write_ply(cloud: &Gaussians, file: &Path) -> Result<(), SplatError> {
     cloud.check_finite()?;
     Ok(write_atomically(file, |w| write_to(cloud, w)).map_err(IoError::at(file))?)
 }
@@ -177,7 +177,7 @@ fn origin_comment(origin: DVec3) -> String {
 ///
 /// # Errors
 /// [`SplatError::Value`] where a channel is not finite.
-pub fn encode_ply(cloud: &Cloud) -> Result<Vec<u8>, SplatError> {
+pub fn encode_ply(cloud: &Gaussians) -> Result<Vec<u8>, SplatError> {
     cloud.check_finite()?;
     let mut bytes = Vec::new();
     write_to(cloud, &mut bytes).expect("memory can be written to");
@@ -206,11 +206,11 @@ pub fn encode_splats(splats: &Splats, up: DVec3) -> Result<Vec<u8>, SplatError> 
     Ok(bytes)
 }
 
-fn write_to(cloud: &Cloud, w: &mut impl Write) -> io::Result<()> {
+fn write_to(cloud: &Gaussians, w: &mut impl Write) -> io::Result<()> {
     write_all(cloud, &Harmonics::default(), &[], w)
 }
 
-fn write_all(cloud: &Cloud, harmonics: &Harmonics, comments: &[String], w: &mut impl Write) -> io::Result<()> {
+fn write_all(cloud: &Gaussians, harmonics: &Harmonics, comments: &[String], w: &mut impl Write) -> io::Result<()> {
     w.write_all(b"ply\nformat binary_little_endian 1.0\n")?;
     comments.iter().try_for_each(|text| writeln!(w, "comment {text}"))?;
     writeln!(w, "element vertex {}", cloud.len())?;

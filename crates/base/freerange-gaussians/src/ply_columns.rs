@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use crate::cloud::Row;
+use crate::gaussians::Row;
 use crate::ply_error::{listed, property_error};
 use crate::ply_header::{Element, Header, Kind, Scalar};
 use crate::{MAX_DEGREE, RenderMode, SplatError, channel, coefficients};

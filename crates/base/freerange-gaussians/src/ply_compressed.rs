@@ -1,24 +1,24 @@
 //! Reading compressed `.ply` files, as PlayCanvas and SuperSplat write them.
 //!
-//! The element `chunk` has bounds of 256 Gaussians each: of positions, log-scales and, in newer files, colours. The
+//! The element `chunk` has bounds of 256 Gaussians each: of positions, log-scales and, in newer files, colors. The
 //! element `vertex` has four words of 32 bits: position and log-scale in 11, 10 and 11 bits between these bounds;
 //! rotation as the number of the largest of `w x y z` in 2 bits and the others in 10 each; color and opacity in 8 bits
 //! each. The element `sh`, if there is one, has further harmonics, channel by channel, in a byte each.
 
-use crate::cloud::Row;
+use crate::gaussians::Row;
 use crate::ply_columns::{rest_count, rest_number};
 use crate::ply_error::{property_error, value_error};
 use crate::ply_file::PlyFile;
 use crate::ply_header::{Element, Header, Kind, Scalar};
 use crate::ply_values::Values;
-use crate::{Cloud, Harmonics, MAX_DEGREE, SplatError, Splats, channel, coefficients};
+use crate::{Gaussians, Harmonics, MAX_DEGREE, SplatError, Splats, channel, coefficients};
 use std::{io::BufRead, path::Path};
 
 /// Gaussians per chunk.
 const CHUNK: u64 = 256;
 /// The words of a Gaussian.
 const WORDS: [&str; 4] = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
-/// The bounds of a chunk, least and greatest of three each; colours may be missing, and are 0 and 1 then.
+/// The bounds of a chunk, least and greatest of three each; colors may be missing, and are 0 and 1 then.
 const BOUNDS: [&str; 18] = [
     "min_x",
     "min_y",
@@ -94,7 +94,7 @@ pub(crate) fn read<R: BufRead>(mut values: Values<'_, R>, header: &Header, at: u
     })?;
     let (harmonics, notes) = harmonics(&mut values, header, at, vertex.count)?;
     let splats = Splats {
-        cloud: Cloud::from_rows(rows),
+        cloud: Gaussians::from_rows(rows),
         harmonics,
         mode: header.comments.mode.unwrap_or_default(),
         origin: header.comments.origin.unwrap_or_default(),

@@ -232,7 +232,7 @@ impl<R: BufRead> Lines<'_, R> {
     }
 
     fn error(&self, expected: &str, found: &str) -> SplatError {
-        // Enough to recognise the line by; a hostile one may be long.
+        // Enough to recognize the line by; a hostile one may be long.
         let found: String = found.chars().take(100).collect();
         SplatError::PlyHeader {
             file: self.file.into(),

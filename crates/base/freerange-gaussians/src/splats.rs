@@ -2,7 +2,7 @@
 
 use glam::{DMat3, DQuat, DVec3};
 
-use crate::{Cloud, Harmonics, channel};
+use crate::{Gaussians, Harmonics, channel};
 
 /// How Gaussians were drawn when they were fitted, and are to be drawn.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
@@ -20,7 +20,7 @@ pub enum RenderMode {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Splats {
     /// The 14 channels; positions are relative to `origin`.
-    pub cloud: Cloud,
+    pub cloud: Gaussians,
     /// Color that depends on the viewing direction, of as many Gaussians, or of degree 0.
     pub harmonics: Harmonics,
     /// How they are to be drawn.
@@ -29,8 +29,8 @@ pub struct Splats {
     pub origin: DVec3,
 }
 
-impl From<Cloud> for Splats {
-    fn from(cloud: Cloud) -> Self {
+impl From<Gaussians> for Splats {
+    fn from(cloud: Gaussians) -> Self {
         Self { cloud, ..Self::default() }
     }
 }
@@ -51,7 +51,7 @@ impl Splats {
     /// Moves everything by the similarity `x -> scale * rotation * x + translation`, harmonics with it.
     ///
     /// # Panics
-    /// As [`Cloud::transform`].
+    /// As [`Gaussians::transform`].
     pub fn transform(&mut self, scale: f64, rotation: DQuat, translation: DVec3) {
         if self.origin == DVec3::ZERO {
             self.cloud.transform(scale, rotation, translation);
@@ -88,7 +88,7 @@ impl Splats {
     }
 
     /// The channels, with positions in world units, rounded to 32 bits.
-    pub fn into_cloud(self) -> Cloud {
+    pub fn into_cloud(self) -> Gaussians {
         let positions: Vec<DVec3> = (0..self.cloud.len()).map(|i| self.position(i)).collect();
         let mut cloud = self.cloud;
         for (row, p) in cloud.iter_mut().zip(positions) {
@@ -99,7 +99,7 @@ impl Splats {
 
     /// The Gaussians as seen from `eye` (in world units): colors are those of this direction, at least 0 where they
     /// depend on it.
-    pub fn seen_from(&self, eye: DVec3) -> Cloud {
+    pub fn seen_from(&self, eye: DVec3) -> Gaussians {
         let mut cloud = self.cloud.clone();
         if self.harmonics.degree() > 0 {
             let eye = eye - self.origin;
@@ -153,7 +153,7 @@ mod tests {
     fn example(n: usize) -> Splats {
         let wave = |n: usize| (0..n).map(|v| (v as f32 * 0.7).sin()).collect::<Vec<_>>();
         let harmonics = Harmonics::from_rows(2, wave(n * 3 * coefficients(2)));
-        Splats { cloud: Cloud::from_rows(wave(n * channel::COUNT)), harmonics, ..Splats::default() }
+        Splats { cloud: Gaussians::from_rows(wave(n * channel::COUNT)), harmonics, ..Splats::default() }
     }
 
     #[test]

@@ -5,7 +5,7 @@
 
 use crate::align::relabel;
 use crate::merge::{gaussians, merge, split_largest};
-use crate::{Alignment, Cloud, Gaussian, SplatError};
+use crate::{Alignment, Gaussian, Gaussians, SplatError};
 use glam::DMat3;
 
 /// Leaves a tree can have: ids of all nodes fit 31 bits.
@@ -42,7 +42,7 @@ impl LodTree {
     /// # Errors
     /// [`SplatError::Empty`], [`SplatError::TooMany`]; [`SplatError::Value`] where a channel is not finite or a
     /// log-scale beyond -40..40.
-    pub fn build(cloud: &Cloud, alignment: Alignment) -> Result<Self, SplatError> {
+    pub fn build(cloud: &Gaussians, alignment: Alignment) -> Result<Self, SplatError> {
         Self::from_gaussians(gaussians(cloud)?, alignment)
     }
 
@@ -52,7 +52,7 @@ impl LodTree {
     ///
     /// # Errors
     /// As [`build`](Self::build).
-    pub fn build_to_depth(cloud: &Cloud, depth: u32, alignment: Alignment) -> Result<Self, SplatError> {
+    pub fn build_to_depth(cloud: &Gaussians, depth: u32, alignment: Alignment) -> Result<Self, SplatError> {
         let mut leaves = gaussians(cloud)?;
         let count = 1usize.checked_shl(depth).filter(|n| *n <= MAX_LEAVES);
         let count = count.ok_or(SplatError::TooMany { limit: MAX_LEAVES, found: usize::MAX })?;
@@ -127,13 +127,13 @@ impl LodTree {
     ///
     /// # Errors
     /// [`SplatError::Depth`] below [`depth_max`](Self::depth_max).
-    pub fn slice(&self, depth: u32) -> Result<Cloud, SplatError> {
+    pub fn slice(&self, depth: u32) -> Result<Gaussians, SplatError> {
         let rows = self.slice_ids(depth)?.into_iter().flat_map(|id| self.nodes[id].gaussian.to_row());
-        Ok(Cloud::from_rows(rows.collect()))
+        Ok(Gaussians::from_rows(rows.collect()))
     }
 }
 
-/// What a split needs of a leaf: its centre, and 3 times its largest scale.
+/// What a split needs of a leaf: its center, and 3 times its largest scale.
 ///
 /// In f32 on purpose. Where one cube holds all others, the sides of their common box are equal but for rounding, and
 /// f32 is the rounding of the published method.

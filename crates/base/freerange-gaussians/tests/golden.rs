@@ -1,6 +1,6 @@
 //! Against vectors of independent references: `tests/golden/lod` and `tests/golden/flow`.
 
-use freerange_gaussians::{Alignment, Cloud, Gaussian, LodTree, Normalization, merge};
+use freerange_gaussians::{Alignment, Gaussian, Gaussians, LodTree, Normalization, merge};
 use freerange_vectors::Vectors;
 use glam::{DMat3, DQuat, DVec3};
 
@@ -149,7 +149,7 @@ fn frames_below_a_shared_root_are_the_published_ones() {
         let frames: Vec<DMat3> =
             golden.rows::<9>("align/rotation").iter().map(|r| DMat3::from_cols_array(r).transpose()).collect();
         let (scales, gap) = (golden.rows::<3>("align/scales"), golden.f32("align/score_gap"));
-        // Relabelling the root relabels every node below in the same way.
+        // Relabeling the root relabels every node below in the same way.
         let change = tree.nodes()[0].gaussian.axes.transpose() * frames[0];
         let mut near_tie = vec![false; tree.nodes().len()];
         let mut compared = 0;
@@ -179,5 +179,5 @@ fn normalization() {
         found.iter().zip(expected).all(|(f, e)| (f - e).abs() <= limit)
     };
     assert!(near(normalization.denormalize(&z1).rows(), golden.f32("out/z1_denormalised")));
-    assert!(near(&normalization.normalize(&Cloud::from_rows(z1.clone())), golden.f32("out/z1_normalised")));
+    assert!(near(&normalization.normalize(&Gaussians::from_rows(z1.clone())), golden.f32("out/z1_normalised")));
 }

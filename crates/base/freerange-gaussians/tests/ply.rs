@@ -1,7 +1,7 @@
 //! `.ply` files: our own, those of other tools, and broken ones.
 
 use freerange_gaussians::{
-    Cloud, Harmonics, PlyFile, RenderMode, SplatError, Splats, channel, coefficients, encode_splats, parse_ply,
+    Gaussians, Harmonics, PlyFile, RenderMode, SplatError, Splats, channel, coefficients, encode_splats, parse_ply,
     read_ply, write_ply,
 };
 use glam::DVec3;
@@ -14,8 +14,8 @@ fn parse(bytes: &[u8]) -> Result<PlyFile, SplatError> {
     parse_ply(bytes, Path::new("test.ply"))
 }
 
-fn example() -> Cloud {
-    Cloud::from_rows((0..6 * channel::COUNT).map(|v| (v as f32 * 0.7).sin()).collect())
+fn example() -> Gaussians {
+    Gaussians::from_rows((0..6 * channel::COUNT).map(|v| (v as f32 * 0.7).sin()).collect())
 }
 
 /// The value of column `name` in a file.
@@ -38,7 +38,7 @@ fn header(format: &str, count: impl std::fmt::Display, columns: &str, kind: &str
     format!("ply\nformat {format} 1.0\ncomment made by a test\nelement vertex {count}\n{properties}end_header\n")
 }
 
-fn ascii(cloud: &Cloud, columns: &str) -> String {
+fn ascii(cloud: &Gaussians, columns: &str) -> String {
     let mut text = header("ascii", cloud.len(), columns, "float");
     for row in cloud {
         let words: Vec<String> = columns.split(' ').map(|c| stored(row, c).to_string()).collect();
@@ -47,8 +47,8 @@ fn ascii(cloud: &Cloud, columns: &str) -> String {
     text
 }
 
-/// Equal in every bit, but for colour, which goes through one rounding.
-fn assert_same(found: &Cloud, expected: &Cloud) {
+/// Equal in every bit, but for color, which goes through one rounding.
+fn assert_same(found: &Gaussians, expected: &Gaussians) {
     assert_eq!(found.len(), expected.len());
     for (f, e) in found.iter().zip(expected) {
         assert_eq!(
@@ -65,9 +65,9 @@ proptest! {
     #[test]
     fn our_files_come_back(rows in prop::collection::vec(prop::array::uniform14(any::<f32>()), 0..50)) {
         let finite = |v: f32| if v.is_finite() { v } else { 1.0 };
-        let mut cloud = Cloud::from_rows(rows.concat().into_iter().map(finite).collect());
+        let mut cloud = Gaussians::from_rows(rows.concat().into_iter().map(finite).collect());
         for row in cloud.iter_mut() {
-            // Of colours a thousand times brighter than white nobody keeps the last bit.
+            // Of colors a thousand times brighter than white nobody keeps the last bit.
             row[channel::COLOR].iter_mut().for_each(|v| *v %= 1000.0);
         }
         let folder = tempfile::tempdir().unwrap();
@@ -121,7 +121,7 @@ fn the_bytes_are_those_of_the_format() {
     let path = folder.path().join("one.ply");
     let mut row = std::array::from_fn::<f32, 14, _>(|i| i as f32);
     row[11..].copy_from_slice(&[0.5, 0.5 + 0.282_094_8, 0.0]);
-    write_ply(&Cloud::from_rows(row.to_vec()), &path).unwrap();
+    write_ply(&Gaussians::from_rows(row.to_vec()), &path).unwrap();
     let bytes = std::fs::read(&path).unwrap();
     let expected = header("binary_little_endian", 1, COLUMNS, "float").replace("comment made by a test\n", "");
     assert_eq!(std::str::from_utf8(&bytes[..expected.len()]).unwrap(), expected);
@@ -158,7 +158,7 @@ fn both_byte_orders_and_doubles() {
 
 #[test]
 fn files_of_other_tools() {
-    // No normals, spherical harmonics of higher order, a byte colour, faces before and after, Windows line ends.
+    // No normals, spherical harmonics of higher order, a byte color, faces before and after, Windows line ends.
     let mut bytes = b"ply\r\nformat binary_little_endian 1.0\r\nobj_info x\r\nelement face 2\r\nproperty list uchar int vertex_indices\r\nelement nothing 99999999999999\r\nelement vertex 1\r\nproperty uchar red\r\n".to_vec();
     let columns = COLUMNS.replace("nx ny nz ", "");
     for name in columns.split(' ').chain(["f_rest_0", "f_rest_1", "f_rest_2"]) {

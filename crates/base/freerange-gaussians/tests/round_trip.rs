@@ -8,22 +8,22 @@ use common::{difference, object};
 use freerange_gaussians::formats::{
     Format, FormatError, Frame, Frames, Loaded, SpzVersion, WriteOptions, encode, parse, read, write,
 };
-use freerange_gaussians::{Cloud, Harmonics, RenderMode, Splats, channel, coefficients};
+use freerange_gaussians::{Gaussians, Harmonics, RenderMode, Splats, channel, coefficients};
 use glam::{DMat3, DQuat, DVec3};
 
 /// [`encode`] of Gaussians without more.
-fn encode_cloud(cloud: &Cloud, format: Format, options: &WriteOptions) -> freerange_gaussians::formats::Encoded {
+fn encode_cloud(cloud: &Gaussians, format: Format, options: &WriteOptions) -> freerange_gaussians::formats::Encoded {
     encode(&cloud.clone().into(), format, options).unwrap()
 }
 
-fn again(cloud: &Cloud, format: Format, options: &WriteOptions) -> Loaded {
+fn again(cloud: &Gaussians, format: Format, options: &WriteOptions) -> Loaded {
     let encoded = encode_cloud(cloud, format, options);
     assert_eq!(encoded, encode_cloud(cloud, format, options), "the same Gaussians give the same bytes");
     parse(format, &encoded.bytes, Path::new("test"), options.frame).unwrap()
 }
 
 /// As [`again`], in the order of the original: `.splat` sorts.
-fn unsorted(cloud: &Cloud, loaded: &Cloud) -> Cloud {
+fn unsorted(cloud: &Gaussians, loaded: &Gaussians) -> Gaussians {
     let nearest = |i: usize| {
         let distance = |j: usize| (loaded.mean(j) - cloud.mean(i)).length_squared();
         (0..loaded.len()).min_by(|&a, &b| distance(a).total_cmp(&distance(b))).unwrap()
@@ -79,7 +79,7 @@ fn frames_are_as_documented() {
     let mut row = [0f32; channel::COUNT];
     row[channel::MEAN].copy_from_slice(&[0.1, 0.2, 0.4]);
     row[channel::ROTATION].copy_from_slice(&[1.0, 0.0, 0.0, 0.0]);
-    let cloud = Cloud::from_rows(row.to_vec());
+    let cloud = Gaussians::from_rows(row.to_vec());
     for (frame, expected) in
         [(Frame::Z_UP, [0.1, 0.4, -0.2]), (Frame::Y_DOWN, [0.1, -0.2, -0.4]), (Frame::Y_UP, [0.1, 0.2, 0.4])]
     {

@@ -1,12 +1,12 @@
 //! Properties of merging and of the level-of-detail tree.
 
-use freerange_gaussians::{Alignment, Cloud, Gaussian, LodTree, OPACITY_RANGE, SplatError, channel, merge};
+use freerange_gaussians::{Alignment, Gaussian, Gaussians, LodTree, OPACITY_RANGE, SplatError, channel, merge};
 use glam::{DMat3, DQuat, DVec3};
 use proptest::prelude::*;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-fn example(n: usize, seed: u64) -> Cloud {
+fn example(n: usize, seed: u64) -> Gaussians {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut data = Vec::new();
     for _ in 0..n {
@@ -16,14 +16,14 @@ fn example(n: usize, seed: u64) -> Cloud {
         data.push(rng.random_range(-4.0f32..5.0));
         data.extend((0..3).map(|_| rng.random_range(0.0f32..1.0)));
     }
-    Cloud::from_rows(data)
+    Gaussians::from_rows(data)
 }
 
-fn gaussians(cloud: &Cloud) -> Vec<Gaussian> {
+fn gaussians(cloud: &Gaussians) -> Vec<Gaussian> {
     cloud.iter().map(Gaussian::from_row).collect()
 }
 
-/// Total weight, weighted centre and weighted second moment about the origin.
+/// Total weight, weighted center and weighted second moment about the origin.
 fn moments<'a>(parts: impl IntoIterator<Item = &'a Gaussian>) -> (f64, DVec3, DMat3) {
     let mut sum = (0.0, DVec3::ZERO, DMat3::ZERO);
     for g in parts {
@@ -190,7 +190,7 @@ fn leaves_come_back_unchanged() {
 #[test]
 fn degenerate_objects() {
     // All alike, and on one spot.
-    let same = Cloud::from_rows(example(1, 4).into_rows().repeat(64));
+    let same = Gaussians::from_rows(example(1, 4).into_rows().repeat(64));
     let tree = LodTree::build(&same, Alignment::Identity).unwrap();
     let root = &tree.nodes()[0].gaussian;
     assert!((root.opacity / (64.0 * same.opacity(0)) - 1.0).abs() < 1e-9, "64 layers weigh as much as 64 Gaussians");
@@ -217,8 +217,8 @@ fn degenerate_objects() {
 
 #[test]
 fn impossible_input_is_refused() {
-    assert!(matches!(LodTree::build(&Cloud::default(), Alignment::Parent), Err(SplatError::Empty)));
-    assert!(matches!(LodTree::build_to_depth(&Cloud::default(), 3, Alignment::Parent), Err(SplatError::Empty)));
+    assert!(matches!(LodTree::build(&Gaussians::default(), Alignment::Parent), Err(SplatError::Empty)));
+    assert!(matches!(LodTree::build_to_depth(&Gaussians::default(), 3, Alignment::Parent), Err(SplatError::Empty)));
     for depth in [31, 63, 64, 1000] {
         assert!(matches!(
             LodTree::build_to_depth(&example(3, 1), depth, Alignment::Parent),

@@ -1,6 +1,6 @@
 //! Small operations on RGBA images: composite, resize, convert, put side by side.
 //!
-//! Images store straight alpha. Whatever mixes pixels mixes them premultiplied, so that the colour of transparent
+//! Images store straight alpha. Whatever mixes pixels mixes them premultiplied, so that the color of transparent
 //! pixels never bleeds into the result.
 
 use image::{Rgba, RgbaImage};
@@ -72,7 +72,7 @@ struct Tap {
     scale: f32,
 }
 
-/// Shrinking: each output takes what its interval covers. Growing: linear interpolation between pixel centres.
+/// Shrinking: each output takes what its interval covers. Growing: linear interpolation between pixel centers.
 fn taps(from: usize, to: usize) -> Vec<Tap> {
     let ratio = from as f64 / to as f64;
     (0..to)
@@ -137,8 +137,8 @@ pub fn resize_area(image: &RgbaImage, width: u32, height: u32) -> RgbaImage {
         for ((t, s), column) in target.iter_mut().zip(&sums).zip(&across) {
             let alpha = (s[3] * tap.scale * column.scale + 0.5) as u8;
             if alpha > 0 {
-                let colour = |c: usize| (s[c] / s[3] + 0.5) as u8;
-                *t = [colour(0), colour(1), colour(2), alpha];
+                let color = |c: usize| (s[c] / s[3] + 0.5) as u8;
+                *t = [color(0), color(1), color(2), alpha];
             }
         }
     }

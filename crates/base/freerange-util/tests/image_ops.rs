@@ -26,8 +26,8 @@ fn area_mean(image: &RgbaImage, x0: f64, x1: f64, y0: f64, y1: f64) -> [f64; 4] 
         }
         sum[3] += alpha;
     }
-    let colour = |c: usize| if sum[3] > 0.0 { sum[c] / sum[3] } else { 0.0 };
-    [colour(0), colour(1), colour(2), sum[3] / ((x1 - x0) * (y1 - y0))]
+    let color = |c: usize| if sum[3] > 0.0 { sum[c] / sum[3] } else { 0.0 };
+    [color(0), color(1), color(2), sum[3] / ((x1 - x0) * (y1 - y0))]
 }
 
 proptest! {
@@ -42,7 +42,7 @@ proptest! {
             let (x, y) = (f64::from(x), f64::from(y));
             let expected = area_mean(&image, x * sx, (x + 1.0) * sx, y * sy, (y + 1.0) * sy);
             for c in 0..4 {
-                // Half a step of rounding; colours of nearly transparent pixels are not stored.
+                // Half a step of rounding; colors of nearly transparent pixels are not stored.
                 let tolerance = if p[3] == 0 && c < 3 { 255.0 } else { 0.501 };
                 prop_assert!((f64::from(p[c]) - expected[c]).abs() <= tolerance, "{:?} {:?}", p, expected);
             }
@@ -50,7 +50,7 @@ proptest! {
     }
 
     #[test]
-    fn growing_stays_within_the_image_and_keeps_plain_colours(
+    fn growing_stays_within_the_image_and_keeps_plain_colors(
         (image, nw, nh) in (1u32..8, 1u32..8).prop_flat_map(|(w, h)| (image(w, h), w..4 * w, h..4 * h))
     ) {
         let large = resize_area(&image, nw, nh);

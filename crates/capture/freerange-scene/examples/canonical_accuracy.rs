@@ -10,14 +10,14 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let folder = std::env::args().nth(1).ok_or("expected a folder of scenes")?;
     let mut scenes: Vec<_> = std::fs::read_dir(folder)?.flatten().map(|e| e.path()).filter(|p| p.is_dir()).collect();
     scenes.sort();
-    println!("{:36} {:>9} {:>8} {:>9}", "scene", "identity", "scale", "centre");
+    println!("{:36} {:>9} {:>8} {:>9}", "scene", "identity", "scale", "center");
     for set in ["full", "partial"] {
-        let (mut scales, mut centres) = (Vec::new(), Vec::new());
+        let (mut scales, mut centers) = (Vec::new(), Vec::new());
         for scene in &scenes {
             let views = Scene::load(&scene.join(format!("transforms_{set}.json")))?.inputs;
             let kept =
                 canonical_from_user(&views, &FrameConfig::default())?.canonical_from_user == Similarity::IDENTITY;
-            let (mut scale, mut centre) = (Vec::new(), Vec::new());
+            let (mut scale, mut center) = (Vec::new(), Vec::new());
             for turn in [0.0, 0.3, 0.8] {
                 let moved = Similarity {
                     scale: 3.7,
@@ -29,16 +29,16 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 let found = canonical_from_user(&views, &FrameConfig::default())?.canonical_from_user;
                 let total = found.after(&moved);
                 scale.push(total.scale);
-                centre.push(total.translation.length());
+                center.push(total.translation.length());
             }
             let name = scene.file_name().unwrap_or_default().to_string_lossy();
-            println!("{:36} {:>9} {:>8.3} {:>9.4}", format!("{name}/{set}"), kept, mean(&scale), mean(&centre));
+            println!("{:36} {:>9} {:>8.3} {:>9.4}", format!("{name}/{set}"), kept, mean(&scale), mean(&center));
             scales.extend(scale.iter().map(|s| (s - 1.0).abs()));
-            centres.extend(centre);
+            centers.extend(center);
         }
         let max = |v: &[f64]| v.iter().copied().fold(0.0, f64::max);
         println!("{set}: |scale - 1| mean {:.4} max {:.4}", mean(&scales), max(&scales));
-        println!("{set}: distance of the centre from the origin, mean {:.4} max {:.4}", mean(&centres), max(&centres));
+        println!("{set}: distance of the center from the origin, mean {:.4} max {:.4}", mean(&centers), max(&centers));
     }
     Ok(())
 }

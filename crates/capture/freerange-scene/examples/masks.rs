@@ -1,4 +1,4 @@
-//! How good masks from poses and colours, or a network's, are: intersection over union with true masks, for every photo.
+//! How good masks from poses and colors, or a network's, are: intersection over union with true masks, for every photo.
 //!
 //! `masks SCENES [--views N] [--mask-model FILE.onnx RANGE]`: folders as `freerange reconstruct` takes them, each with `truth/masks/NAME.png`, which are only compared
 //! with. `--views N` uses the first N photos only; `--write FOLDER` writes the masks; `--mask-model`

@@ -76,7 +76,7 @@ pub enum SceneError {
         /// What is wrong.
         what: String,
     },
-    /// Something that is recognised and cannot be used.
+    /// Something that is recognized and cannot be used.
     #[error("{}{}: {feature} is not supported; {advice}", file.display(), at(place))]
     Unsupported {
         /// The file.

@@ -91,11 +91,11 @@ fn place(frame: &CanonicalFrame) -> (DVec3, f64, DVec3) {
 }
 
 fn view_reports(loaded: &Loaded, frame: &CanonicalFrame, shown: &[usize]) -> Vec<ViewReport> {
-    let (centre, radius, up) = place(frame);
-    let agreement = estimate::agreement(&loaded.views, centre, 1.5 * radius);
+    let (center, radius, up) = place(frame);
+    let agreement = estimate::agreement(&loaded.views, center, 1.5 * radius);
     let contradicts = match loaded.views.len() {
         0..3 => vec![0.0; loaded.views.len()],
-        _ => estimate::contradictions(&loaded.views, centre, 1.5 * radius),
+        _ => estimate::contradictions(&loaded.views, center, 1.5 * radius),
     };
     let to_up = DQuat::from_rotation_arc(up, DVec3::Z);
     loaded
@@ -104,7 +104,7 @@ fn view_reports(loaded: &Loaded, frame: &CanonicalFrame, shown: &[usize]) -> Vec
         .enumerate()
         .map(|(i, view)| {
             let c = &view.camera;
-            let from = to_up * (c.center() - centre);
+            let from = to_up * (c.center() - center);
             let alpha: Vec<u8> = view.image.pixels().map(|p| p[3]).collect();
             let covered = alpha.iter().filter(|a| **a >= 128).count();
             let is_shown = shown.contains(&i);
@@ -140,7 +140,7 @@ pub fn inspect(
     frame: &CanonicalFrame,
     shown: &[usize],
 ) -> Inspection {
-    let (centre, radius, up) = place(frame);
+    let (center, radius, up) = place(frame);
     let views = view_reports(loaded, frame, shown);
     let sureness = loaded.estimate.as_ref().map(estimate::Estimate::sureness);
     let found = frame.notes.iter().map(Note::understood);
@@ -152,7 +152,7 @@ pub fn inspect(
         files: cameras.files.clone(),
         masks: loaded.masks,
         sureness,
-        center: centre.to_array(),
+        center: center.to_array(),
         radius,
         up: up.to_array(),
         further: loaded.further.len(),
@@ -251,11 +251,11 @@ pub fn sheet(loaded: &Loaded, inspection: &Inspection) -> RgbaImage {
         text(&mut sheet, 4, 3 + LINE * (1 + i as u32), warning, RED);
     }
     map(&mut sheet, 0, head, inspection);
-    let (centre, radius) = (DVec3::from_array(inspection.center), inspection.radius);
+    let (center, radius) = (DVec3::from_array(inspection.center), inspection.radius);
     for (i, (view, report)) in loaded.views.iter().zip(&inspection.views).enumerate() {
         let place = i as u32 + 1;
         let (x, y) = (place % columns * TILE, head + place / columns * (TILE + 2 * LINE));
-        let picture = tile(view, &loaded.whole[i], report, centre, radius);
+        let picture = tile(view, &loaded.whole[i], report, center, radius);
         image::imageops::overlay(&mut sheet, &picture, i64::from(x), i64::from(y + LINE));
         let ink = if report.doubtful() || report.cut_off { RED } else { INK };
         let line = format!(
@@ -270,7 +270,7 @@ pub fn sheet(loaded: &Loaded, inspection: &Inspection) -> RgbaImage {
     sheet
 }
 
-fn tile(view: &View, whole: &RgbaImage, report: &ViewReport, centre: DVec3, radius: f64) -> RgbaImage {
+fn tile(view: &View, whole: &RgbaImage, report: &ViewReport, center: DVec3, radius: f64) -> RgbaImage {
     let (w, h) = whole.dimensions();
     let side = f64::from(TILE - 4) / f64::from(w.max(h));
     let (nw, nh) = ((f64::from(w) * side).max(1.0) as u32, (f64::from(h) * side).max(1.0) as u32);
@@ -290,7 +290,7 @@ fn tile(view: &View, whole: &RgbaImage, report: &ViewReport, centre: DVec3, radi
         p[3] = 255;
     }
     let camera = view.camera.resized(nw, nh);
-    for (x, y) in sphere_outline(&camera, centre, radius) {
+    for (x, y) in sphere_outline(&camera, center, radius) {
         if x >= 0.0 && y >= 0.0 && x < f64::from(nw) && y < f64::from(nh) {
             picture.put_pixel(x as u32, y as u32, ORANGE);
         }
@@ -299,8 +299,8 @@ fn tile(view: &View, whole: &RgbaImage, report: &ViewReport, centre: DVec3, radi
 }
 
 /// Points of the outline of a sphere, in pixels: where its tangent rays pass.
-fn sphere_outline(camera: &Camera, centre: DVec3, radius: f64) -> Vec<(f64, f64)> {
-    let towards = centre - camera.center();
+fn sphere_outline(camera: &Camera, center: DVec3, radius: f64) -> Vec<(f64, f64)> {
+    let towards = center - camera.center();
     let distance = towards.length();
     if distance <= radius {
         return Vec::new();
@@ -324,12 +324,12 @@ fn map(sheet: &mut RgbaImage, left: u32, top: u32, inspection: &Inspection) {
     let half = 0.5 * f64::from(TILE);
     let farthest = inspection.views.iter().map(|v| v.distance).fold(1.0, f64::max);
     let scale = 0.85 * half / farthest;
-    let mut dot = |x: f64, y: f64, r: i64, colour: Rgba<u8>| {
+    let mut dot = |x: f64, y: f64, r: i64, color: Rgba<u8>| {
         for dy in -r..=r {
             for dx in -r..=r {
                 let (px, py) = ((half + x) as i64 + dx, (half - y) as i64 + dy);
                 if dx * dx + dy * dy <= r * r && px >= 0 && py >= 0 && px < i64::from(TILE) && py < i64::from(TILE) {
-                    sheet.put_pixel(left + px as u32, top + LINE + py as u32, colour);
+                    sheet.put_pixel(left + px as u32, top + LINE + py as u32, color);
                 }
             }
         }
@@ -342,8 +342,8 @@ fn map(sheet: &mut RgbaImage, left: u32, top: u32, inspection: &Inspection) {
     for (i, view) in inspection.views.iter().enumerate() {
         let (s, c) = view.azimuth.to_radians().sin_cos();
         let reach = scale * view.distance * view.elevation.to_radians().cos();
-        let colour = if view.shown { GREEN } else { GRAY };
-        dot(reach * c, reach * s, 4, colour);
+        let color = if view.shown { GREEN } else { GRAY };
+        dot(reach * c, reach * s, 4, color);
         labels.push((half + reach * c + 6.0, half - reach * s - 4.0, format!("{}", i + 1)));
     }
     for (x, y, label) in labels {

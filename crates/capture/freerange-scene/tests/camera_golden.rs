@@ -33,7 +33,7 @@ fn plucker_coordinates() {
     }
 }
 
-fn centres(name: &str) -> Vec<DVec3> {
+fn centers(name: &str) -> Vec<DVec3> {
     let file = json(&format!("views/{name}.json"));
     let number = |v: &serde_json::Value| v.as_f64().unwrap();
     let point = |c: &serde_json::Value| DVec3::new(number(&c[0]), number(&c[1]), number(&c[2]));
@@ -53,34 +53,34 @@ fn centres(name: &str) -> Vec<DVec3> {
 #[test]
 fn selections_have_the_required_properties() {
     for name in ["cams24_ring", "cams40_jitter"] {
-        let centres = centres(name);
-        let n = centres.len();
+        let centers = centers(name);
+        let n = centers.len();
         let mut spread = [0.0; 2];
         for seed in 0..8 {
             let config = SelectionConfig { seed, ..Default::default() };
-            let sets = select_views(&centres, DVec3::ZERO, &config).unwrap();
+            let sets = select_views(&centers, DVec3::ZERO, &config).unwrap();
             assert_eq!(
                 sets,
-                select_views(&centres, DVec3::ZERO, &config).unwrap(),
+                select_views(&centers, DVec3::ZERO, &config).unwrap(),
                 "the same seed chooses the same views"
             );
             assert_eq!(sets.labels.len(), n);
 
             // A fixed point of Lloyd's iteration, and not a bad one.
             let mean = |c: usize| {
-                let own: Vec<DVec3> = (0..n).filter(|&i| sets.labels[i] == c).map(|i| centres[i]).collect();
+                let own: Vec<DVec3> = (0..n).filter(|&i| sets.labels[i] == c).map(|i| centers[i]).collect();
                 assert!(!own.is_empty(), "cluster {c} is empty");
                 own.iter().sum::<DVec3>() / own.len() as f64
             };
             let means: Vec<DVec3> = (0..4).map(mean).collect();
             let mut inertia = 0.0;
-            for (c, &label) in centres.iter().zip(&sets.labels) {
+            for (c, &label) in centers.iter().zip(&sets.labels) {
                 let own = c.distance_squared(means[label]);
                 assert!(means.iter().all(|m| own <= c.distance_squared(*m) + 1e-6));
                 inertia += own;
             }
             let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(99);
-            assert!(inertia <= 1.6 * k_means(&centres, 4, 40, &mut rng).1);
+            assert!(inertia <= 1.6 * k_means(&centers, 4, 40, &mut rng).1);
 
             let mut clusters: Vec<usize> = sets.full.iter().map(|&i| sets.labels[i]).collect();
             clusters.sort_unstable();
@@ -91,8 +91,8 @@ fn selections_have_the_required_properties() {
 
             assert!(!sets.validation.is_empty());
             assert!(sets.validation.iter().all(|i| !sets.full.contains(i) && !sets.partial.contains(i)));
-            let seen: Vec<DVec3> = sets.validation.iter().map(|&i| centres[i].normalize()).collect();
-            for c in &centres {
+            let seen: Vec<DVec3> = sets.validation.iter().map(|&i| centers[i].normalize()).collect();
+            for c in &centers {
                 let gap = seen.iter().map(|v| v.angle_between(*c)).fold(f64::INFINITY, f64::min);
                 assert!(gap.to_degrees() <= 115.0);
             }
@@ -100,7 +100,7 @@ fn selections_have_the_required_properties() {
 
             for (views, sum) in [&sets.full, &sets.partial].into_iter().zip(&mut spread) {
                 let pairs = views.iter().flat_map(|&a| views.iter().map(move |&b| (a, b))).filter(|(a, b)| a < b);
-                *sum += pairs.map(|(a, b)| centres[a].angle_between(centres[b])).fold(f64::INFINITY, f64::min);
+                *sum += pairs.map(|(a, b)| centers[a].angle_between(centers[b])).fold(f64::INFINITY, f64::min);
             }
         }
         assert!(spread[0] > spread[1], "full views lie farther apart than partial ones");
@@ -110,7 +110,7 @@ fn selections_have_the_required_properties() {
 #[test]
 fn selections_that_cannot_be_made_are_refused() {
     let ring: Vec<DVec3> = (0..24).map(|i| DVec3::new((i as f64).cos(), (i as f64).sin(), 0.2)).collect();
-    let choose = |centres: &[DVec3], config: SelectionConfig| select_views(centres, DVec3::ZERO, &config);
+    let choose = |centers: &[DVec3], config: SelectionConfig| select_views(centers, DVec3::ZERO, &config);
     let default = SelectionConfig::default;
     assert!(choose(&ring, default()).is_ok());
     assert!(choose(&ring[..5], default()).is_err());

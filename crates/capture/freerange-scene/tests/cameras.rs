@@ -284,13 +284,13 @@ fn what_a_folder_is_is_found_out_and_said() {
     assert_eq!(turned.photos.len(), 3);
     let camera = turned.photos[1].camera((640, 480)).unwrap();
     assert!((camera.fx - 320.0 / 30f64.to_radians().tan()).abs() < 1e-9);
-    let centre = camera.center();
+    let center = camera.center();
     let (azimuth, elevation) =
-        (centre.y.atan2(centre.x).to_degrees(), (centre.z / centre.length()).asin().to_degrees());
+        (center.y.atan2(center.x).to_degrees(), (center.z / center.length()).asin().to_degrees());
     assert!((azimuth + 120.0).abs() < 1e-9 && (elevation - 20.0).abs() < 1e-9);
 }
 
-/// A camera in no special position: its axes in the world (right, down, forward), and its centre.
+/// A camera in no special position: its axes in the world (right, down, forward), and its center.
 fn odd_pose() -> (DMat3, DVec3) {
     let camera = Camera::look_at(DVec3::new(1.0, -2.0, 1.5), DVec3::new(0.1, 0.2, 0.3), DVec3::Z, 0.8, 640, 480);
     (DMat3::from_mat4(camera.world_to_camera).transpose(), camera.center())
@@ -299,8 +299,8 @@ fn odd_pose() -> (DMat3, DVec3) {
 #[test]
 fn polycam_is_read_as_nerfstudio_reads_it() {
     // nerfstudio's matrix is camera to world with OpenGL's axes, rows 2, 0, 1 of Polycam's.
-    let (axes, centre) = odd_pose();
-    let gl = [axes.x_axis, -axes.y_axis, -axes.z_axis, centre];
+    let (axes, center) = odd_pose();
+    let gl = [axes.x_axis, -axes.y_axis, -axes.z_axis, center];
     let mut root = json!({"fx": 500.0, "fy": 501.0, "cx": 320.0, "cy": 239.0, "width": 640, "height": 480});
     for (ours, theirs) in [(0, 2), (1, 0), (2, 1)] {
         for (j, column) in gl.iter().enumerate() {
@@ -309,7 +309,7 @@ fn polycam_is_read_as_nerfstudio_reads_it() {
     }
     let file = Path::new("1.json");
     let camera = polycam::camera(file, root.to_string().as_bytes(), None).unwrap();
-    assert!(camera.center().distance(centre) < 1e-12 && (camera.fx, camera.fy, camera.cy) == (500.0, 501.0, 239.0));
+    assert!(camera.center().distance(center) < 1e-12 && (camera.fx, camera.fy, camera.cy) == (500.0, 501.0, 239.0));
     assert!(camera.ray_direction(320.0, 239.0).distance(axes.z_axis) < 1e-12);
 
     let folder = tempfile::tempdir().unwrap();
@@ -339,9 +339,9 @@ fn polycam_is_read_as_nerfstudio_reads_it() {
 
 #[test]
 fn metashape_is_read() {
-    let (axes, centre) = odd_pose();
+    let (axes, center) = odd_pose();
     let m: Vec<String> = (0..3)
-        .flat_map(|i| [axes.x_axis[i], axes.y_axis[i], axes.z_axis[i], centre[i]])
+        .flat_map(|i| [axes.x_axis[i], axes.y_axis[i], axes.z_axis[i], center[i]])
         .chain([0.0, 0.0, 0.0, 1.0])
         .map(|v| format!("{v:e}"))
         .collect();
@@ -361,7 +361,7 @@ fn metashape_is_read() {
     assert!(notes.iter().any(|n| n.kind == NoteKind::Dropped && n.contains("1 photos have no pose")), "{notes:?}");
     let c = photos[0].camera;
     assert_eq!((c.fx, c.fy, c.cx, c.cy), (503.0, 500.0, 321.5, 238.0));
-    assert!(c.center().distance(centre) < 1e-9 && c.ray_direction(c.cx, c.cy).distance(axes.z_axis) < 1e-9);
+    assert!(c.center().distance(center) < 1e-9 && c.ray_direction(c.cx, c.cy).distance(axes.z_axis) < 1e-9);
     // The manual's formula, written out.
     let (x, y) = (0.3, -0.2);
     let q: f64 = x * x + y * y;

@@ -1,4 +1,4 @@
-//! Masks from poses and colours: on a scene drawn here, on broken poses, and on the photo-like scenes of the shared folder.
+//! Masks from poses and colors: on a scene drawn here, on broken poses, and on the photo-like scenes of the shared folder.
 
 use freerange_scene::camera::{Camera, View};
 use freerange_scene::{
@@ -28,14 +28,14 @@ fn object(eye: DVec3, d: DVec3) -> Option<(f64, DVec3)> {
         normal[axis] = -d[axis].signum();
         best = Some((near.max_element(), normal));
     }
-    let (centre, r) = (DVec3::new(-0.02, 0.02, 0.19), 0.09);
-    let to = centre - eye;
+    let (center, r) = (DVec3::new(-0.02, 0.02, 0.19), 0.09);
+    let to = center - eye;
     let along = to.dot(d);
     let square = r * r - (to.length_squared() - along * along);
     if square > 0.0 {
         let t = along - square.sqrt();
         if t > 0.0 && best.is_none_or(|b| t < b.0) {
-            best = Some((t, (eye + t * d - centre) / r));
+            best = Some((t, (eye + t * d - center) / r));
         }
     }
     best
@@ -49,7 +49,7 @@ fn draw(camera: &Camera) -> (RgbaImage, Vec<bool>) {
         let (eye, d) = (camera.center(), camera.ray_direction(f64::from(x) + 0.5, f64::from(y) + 0.5));
         let hit = object(eye, d);
         mask.push(hit.is_some());
-        let colour = if let Some((t, normal)) = hit {
+        let color = if let Some((t, normal)) = hit {
             let p = eye + t * d;
             let stripe =
                 if (p.z * 60.0).sin() > 0.3 { DVec3::new(60.0, 110.0, 190.0) } else { DVec3::new(200.0, 205.0, 215.0) };
@@ -64,7 +64,7 @@ fn draw(camera: &Camera) -> (RgbaImage, Vec<bool>) {
             DVec3::new(120.0 + 60.0 * d.x, 130.0 - 40.0 * d.y, 140.0 + 50.0 * d.z)
         };
         let noise = f64::from((x * 7919 + y * 104_729) % 7) - 3.0;
-        let [r, g, b] = (colour + noise).to_array().map(|v| v.clamp(0.0, 255.0) as u8);
+        let [r, g, b] = (color + noise).to_array().map(|v| v.clamp(0.0, 255.0) as u8);
         Rgba([r, g, b, 255])
     });
     (image, mask)
@@ -117,8 +117,8 @@ fn an_object_on_a_table_is_cut_out() {
     let whole: Vec<RgbaImage> = views.iter().map(|v| v.image.clone()).collect();
     assert!(table_faces(&cut, &whole).unwrap().angle_between(DVec3::Z) < 0.02);
     // True masks agree with their hull; a mask in another's place does not.
-    let centre = DVec3::new(0.0, 0.0, 0.13);
-    assert!(agreement(&cut, centre, 0.4).iter().all(|a| *a > 0.85));
+    let center = DVec3::new(0.0, 0.0, 0.13);
+    assert!(agreement(&cut, center, 0.4).iter().all(|a| *a > 0.85));
 }
 
 #[test]
@@ -129,7 +129,7 @@ fn the_same_photos_give_the_same_masks() {
     assert_eq!((a.alpha, a.agreement), (b.alpha, b.agreement));
 }
 
-/// What the others would show, were they to know all: where the object is, and the colour that it has there.
+/// What the others would show, were they to know all: where the object is, and the color that it has there.
 fn truth_shown(views: &[View]) -> Result<Vec<RgbaImage>, String> {
     let shown = |v: &View| {
         let (mut image, (_, mask)) = (v.image.clone(), draw(&v.camera));
@@ -142,7 +142,7 @@ fn truth_shown(views: &[View]) -> Result<Vec<RgbaImage>, String> {
 #[test]
 fn what_the_other_views_show_mends_masks() {
     let (mut views, truth) = scene();
-    // Print in the table's colour, in four photos.
+    // Print in the table's color, in four photos.
     for (view, mask) in views.iter_mut().zip(&truth).step_by(2) {
         let width = W as usize;
         let inside: Vec<(usize, usize)> =
@@ -160,7 +160,7 @@ fn what_the_other_views_show_mends_masks() {
         found.alpha.iter().zip(&truth).map(|(a, t)| overlap(&solid(a), t)).collect::<Vec<f64>>()
     };
     let (before, after) = (shares(None), shares(Some(truth_shown as OthersShow)));
-    // Three of them are filled by colours and outlines alone.
+    // Three of them are filled by colors and outlines alone.
     assert!(before.iter().any(|s| *s < 0.95), "{before:?}");
     assert!(after.iter().all(|s| *s > 0.98), "{before:?} {after:?}");
 }
@@ -262,11 +262,11 @@ fn generated_scenes_tell_right_poses_from_wrong_ones() {
     }
 }
 
-/// What is hard about these: a bowl of one colour, whose foot all views see as a print on the table, eight of them or sixteen; the opening
+/// What is hard about these: a bowl of one color, whose foot all views see as a print on the table, eight of them or sixteen; the opening
 /// of a handle, before a wall; other objects, some of them touched by the outline; a pan that lies flat, all but its handle; a wall that
 /// looks like a table far above.
 #[test]
-fn bowls_handles_and_neighbours_are_told_apart() {
+fn bowls_handles_and_neighbors_are_told_apart() {
     let cases = [(504, 2, 0.97), (504, 1, 0.97), (3000, 2, 0.96), (3002, 2, 0.97), (4008, 1, 0.96), (4023, 1, 0.93)];
     for (seed, every, least) in cases {
         let scene = tabletop::tabletop(seed, 16, std::f64::consts::TAU, (320, 240));

@@ -28,9 +28,9 @@ fn ring(target: DVec3, distance: f64, angles: &[f64]) -> Vec<Camera> {
 const AROUND: [f64; 4] = [0.2, 1.8, 3.3, 4.9];
 const ONE_SIDE: [f64; 4] = [0.0, 0.35, 0.6, 0.9];
 
-/// What the camera sees of a ball: silhouettes exactly, by the ray's distance from its centre.
-fn ball(camera: Camera, centre: DVec3, radius: f64) -> View {
-    let offset = centre - camera.center();
+/// What the camera sees of a ball: silhouettes exactly, by the ray's distance from its center.
+fn ball(camera: Camera, center: DVec3, radius: f64) -> View {
+    let offset = center - camera.center();
     let image = RgbaImage::from_fn(SIDE, SIDE, |x, y| {
         let d = camera.ray_direction(f64::from(x) + 0.5, f64::from(y) + 0.5);
         if offset.cross(d).length() < radius { Rgba([90, 80, 70, 255]) } else { Rgba([0; 4]) }
@@ -78,14 +78,14 @@ proptest! {
 
 #[test]
 fn a_ball_is_found() {
-    let (centre, radius) = (DVec3::new(4.0, -5.0, 6.0), 0.12);
+    let (center, radius) = (DVec3::new(4.0, -5.0, 6.0), 0.12);
     for (angles, place, size) in [(AROUND, 0.05, 0.03), (ONE_SIDE, 0.08, 0.04)] {
         // The cameras look past the ball, so that only the masks tell where it is.
-        let target = centre + DVec3::new(0.05, 0.02, -0.04);
-        let views: Vec<View> = ring(target, 0.6, &angles).into_iter().map(|c| ball(c, centre, radius)).collect();
+        let target = center + DVec3::new(0.05, 0.02, -0.04);
+        let views: Vec<View> = ring(target, 0.6, &angles).into_iter().map(|c| ball(c, center, radius)).collect();
         let found = canonical_from_user(&views, &FrameConfig::default()).unwrap();
         let s = found.canonical_from_user;
-        assert!(s.apply(centre).length() < place, "{}", s.apply(centre));
+        assert!(s.apply(center).length() < place, "{}", s.apply(center));
         assert!((s.scale * radius / 0.5 - 1.0).abs() < size, "{}", s.scale * radius);
         assert_eq!(s.rotation, DQuat::IDENTITY);
         assert_eq!(found.notes.len(), 1);
@@ -94,13 +94,13 @@ fn a_ball_is_found() {
 
 #[test]
 fn a_speck_in_one_mask_does_little_harm() {
-    let centre = DVec3::new(1.0, 2.0, 3.0);
-    let mut views: Vec<View> = ring(centre, 3.0, &AROUND).into_iter().map(|c| ball(c, centre, 0.4)).collect();
+    let center = DVec3::new(1.0, 2.0, 3.0);
+    let mut views: Vec<View> = ring(center, 3.0, &AROUND).into_iter().map(|c| ball(c, center, 0.4)).collect();
     views[2].image.put_pixel(20, 230, Rgba([255; 4]));
     let s = canonical_from_user(&views, &FrameConfig::default()).unwrap().canonical_from_user;
     // Taken at its word, the speck would shrink the object to a quarter; the hull's own corners cost some.
     assert!((0.7..1.05).contains(&(s.scale * 0.4 / 0.5)), "{}", s.scale);
-    assert!(s.apply(centre).length() < 0.05);
+    assert!(s.apply(center).length() < 0.05);
 }
 
 #[test]

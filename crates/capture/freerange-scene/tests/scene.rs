@@ -19,7 +19,7 @@ fn cut_out_image() -> RgbaImage {
     RgbaImage::from_fn(SIDE, SIDE, |x, y| if disc(x, y) { Rgba([200, 30, 20, 255]) } else { Rgba([0; 4]) })
 }
 
-/// A red disc before light grey, with a little noise.
+/// A red disc before light gray, with a little noise.
 fn plain_image() -> RgbImage {
     RgbImage::from_fn(SIDE, SIDE, |x, y| {
         let noise = ((x * 7 + y * 13) % 5) as u8;
@@ -186,8 +186,8 @@ fn a_soft_edge_is_unmixed() {
         let c = |i: usize| (a * object[i] + (1.0 - a) * background[i]).round() as u8;
         Rgba([c(0), c(1), c(2), 255])
     });
-    let (cut, colour) = freerange_scene::camera::scene::cut_out(&image).unwrap();
-    assert_eq!(colour, [20, 200, 90]);
+    let (cut, color) = freerange_scene::camera::scene::cut_out(&image).unwrap();
+    assert_eq!(color, [20, 200, 90]);
     for (x, y, p) in cut.enumerate_pixels() {
         let expected = 255.0 * coverage(x, y);
         assert!((f32::from(p[3]) - expected).abs() <= 20.0, "{x} {y}: {} {expected}", p[3]);
@@ -202,8 +202,8 @@ fn other_pixel_formats_are_converted() {
     let files = Files::new();
     let deep = DynamicImage::from(cut_out_image()).into_rgba16();
     deep.save(files.path("images/000.png")).unwrap();
-    let grey = ImageBuffer::from_fn(SIDE, SIDE, |x, y| image::Luma([if disc(x, y) { 40u8 } else { 250 }]));
-    grey.save(files.path("images/001.png")).unwrap();
+    let gray = ImageBuffer::from_fn(SIDE, SIDE, |x, y| image::Luma([if disc(x, y) { 40u8 } else { 250 }]));
+    gray.save(files.path("images/001.png")).unwrap();
     std::fs::remove_file(files.path("images/002.png")).unwrap();
     plain_image().save(files.path("images/002.jpg")).unwrap();
     let scene = files.load(&description()).unwrap();
@@ -212,7 +212,7 @@ fn other_pixel_formats_are_converted() {
     assert_eq!(scene.inputs[1].image.get_pixel(0, 0)[3], 0);
     let solid = scene.inputs[2].image.pixels().filter(|p| p[3] > 128).count() as i32;
     let expected = cut_out_image().pixels().filter(|p| p[3] > 0).count() as i32;
-    // JPEG smears colour over one ring of pixels.
+    // JPEG smears color over one ring of pixels.
     assert!((solid - expected).abs() < 70, "{solid} {expected}");
 }
 
@@ -365,8 +365,8 @@ fn a_rim_of_nothing_is_no_backdrop() {
             (x, y) if disc(x, y) => Rgba([200, 20, 10, 255]),
             _ => Rgba([250, 250, 248, 255]),
         });
-        let (cut, colour) = freerange_scene::camera::scene::cut_out(&image).unwrap();
-        assert_eq!(colour, [250, 250, 248]);
+        let (cut, color) = freerange_scene::camera::scene::cut_out(&image).unwrap();
+        assert_eq!(color, [250, 250, 248]);
         let wrong = cut.enumerate_pixels().filter(|(x, y, p)| (p[3] > 128) != disc(*x as i32, *y as i32)).count();
         assert!(wrong < 20, "{wrong} pixels, rim {rim}, empty {empty}");
     }
@@ -375,8 +375,8 @@ fn a_rim_of_nothing_is_no_backdrop() {
         true => Rgba([240, 240, 240, 255]),
         false => Rgba([3, 2, 4, 255]),
     });
-    let (cut, colour) = freerange_scene::camera::scene::cut_out(&image).unwrap();
-    assert!(colour[0] < 8 && cut.pixels().filter(|p| p[3] > 128).count() > 1000);
+    let (cut, color) = freerange_scene::camera::scene::cut_out(&image).unwrap();
+    assert!(color[0] < 8 && cut.pixels().filter(|p| p[3] > 128).count() > 1000);
 }
 
 #[test]

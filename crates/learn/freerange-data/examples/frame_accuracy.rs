@@ -1,5 +1,5 @@
 //! How far the frame is off, before and after a quick fit corrects it: generated objects, seen by four cameras around
-//! them or on one side, moved, turned about the vertical and scaled. Scale as |log|, the centre's distance for a sphere of radius
+//! them or on one side, moved, turned about the vertical and scaled. Scale as |log|, the center's distance for a sphere of radius
 //! 0.5; means with 95 % intervals. Scenes, where given, are held to fill that sphere, and not turned.
 //! `cargo run --release -p freerange-data --example frame_accuracy -- OBJECTS [FOLDER_OF_SCENES]`
 
@@ -16,7 +16,7 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
 type Failure = Box<dyn std::error::Error + Send + Sync>;
-/// Of scale and centre, before and after.
+/// Of scale and center, before and after.
 type Errors = [f64; 4];
 
 fn main() -> Result<(), Failure> {
@@ -28,7 +28,7 @@ fn main() -> Result<(), Failure> {
     let generated: Vec<[Errors; 2]> =
         (0..objects).into_par_iter().map(|i| object(7_000_000_002_000 + i, &config)).collect::<Result<_, _>>()?;
     println!(
-        "| views | n | scale, before | after | gain | centre, before | after | gain |\n|---|---|---|---|---|---|---|---|"
+        "| views | n | scale, before | after | gain | center, before | after | gain |\n|---|---|---|---|---|---|---|---|"
     );
     for (k, name) in ["generated, full", "generated, partial"].into_iter().enumerate() {
         row(name, &generated.iter().map(|e| e[k]).collect::<Vec<_>>());
@@ -56,8 +56,8 @@ fn object(seed: u64, config: &ObjectConfig) -> Result<[Errors; 2], Failure> {
     let truth = |total: &Similarity| {
         let points = || mesh.positions.iter().map(|p| total.apply(p.as_dvec3()));
         let (low, high) = points().fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(l, h), p| (l.min(p), h.max(p)));
-        let centre = 0.5 * (low + high);
-        (centre, points().map(|p| p.distance(centre)).fold(0.0, f64::max))
+        let center = 0.5 * (low + high);
+        (center, points().map(|p| p.distance(center)).fold(0.0, f64::max))
     };
     let mut errors = |chosen: &[usize]| {
         let views: Vec<View> = chosen.iter().map(|&i| object.views[i].clone()).collect();
@@ -76,7 +76,7 @@ fn scene(path: &Path) -> Result<Errors, Failure> {
     errors(&Scene::load(path)?.inputs, &moved, |total| (total.translation, 0.5 * total.scale))
 }
 
-/// `truth` says where the object is, centre and radius, in the frame that a similarity leads to.
+/// `truth` says where the object is, center and radius, in the frame that a similarity leads to.
 fn errors(views: &[View], moved: &Similarity, truth: impl Fn(&Similarity) -> (DVec3, f64)) -> Result<Errors, Failure> {
     let seen_from = |views: &[View], to: &Similarity| -> Vec<View> {
         views.iter().map(|v| View { camera: v.camera.transformed(to), ..v.clone() }).collect()
@@ -87,8 +87,8 @@ fn errors(views: &[View], moved: &Similarity, truth: impl Fn(&Similarity) -> (DV
     let cloud = quick_fit(&views, &QuickFitConfig::default(), 0, |_| ControlFlow::Continue(()))?;
     let total = rough.after(moved);
     let off = |total: &Similarity| {
-        let (centre, radius) = truth(total);
-        [(radius / 0.5).ln().abs(), 0.5 * centre.length() / radius]
+        let (center, radius) = truth(total);
+        [(radius / 0.5).ln().abs(), 0.5 * center.length() / radius]
     };
     let ([a, c], [b, d]) = (off(&total), off(&frame_of(&cloud, &views)?.after(&total)));
     Ok([a, b, c, d])

@@ -6,7 +6,7 @@ use std::{ops::ControlFlow, time::Instant};
 
 use freerange_data::Object;
 use freerange_data::build::{ObjectConfig, generate_object};
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_optim::{QuickFitConfig, quick_fit, tree_slice};
 use freerange_raster::metrics::psnr;
 use freerange_raster::{RasterConfig, render};
@@ -59,7 +59,7 @@ fn scores(object: &Object, quick: &QuickFitConfig) -> [f64; 4] {
     scores
 }
 
-fn score(cloud: &Cloud, view: &View) -> f64 {
+fn score(cloud: &Gaussians, view: &View) -> f64 {
     let image = render(cloud.rows(), &[view.camera], &[[1.0; 3]], &RasterConfig::default()).expect("a render");
     let shown: Vec<f32> = image.rgb.iter().map(|v| v.clamp(0.0, 1.0)).collect();
     psnr(&shown, &composite(&view.image, [1.0; 3])).expect("equal sizes")

@@ -431,7 +431,7 @@ impl Manifest {
         self.shards.len() as u64 == self.plan.shard_count()
     }
 
-    /// Statistics over all Gaussians of the slices for training at `depth`, from which normalisation follows; `None` if
+    /// Statistics over all Gaussians of the slices for training at `depth`, from which normalization follows; `None` if
     /// there are no such slices.
     pub fn statistics(&self, depth: u32) -> Option<Statistics> {
         let mut all = Statistics::default();

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_scene::camera::View;
 
 use crate::DataError;
@@ -15,14 +15,14 @@ pub struct Object {
     /// Posed images, all of one size.
     pub views: Vec<View>,
     /// Slices of the level-of-detail tree by depth; depth `l` has `2^l` Gaussians in tree order.
-    pub slices: BTreeMap<u32, Cloud>,
+    pub slices: BTreeMap<u32, Gaussians>,
     /// What a few of the views tell without a network.
     pub input_fits: Vec<InputFit>,
 }
 
 impl Object {
     /// The Gaussians at `depth`.
-    pub fn slice(&self, depth: u32) -> Result<&Cloud, DataError> {
+    pub fn slice(&self, depth: u32) -> Result<&Gaussians, DataError> {
         self.slices.get(&depth).ok_or_else(|| DataError::Depth {
             object: self.id.clone(),
             expected: depth,
@@ -37,10 +37,10 @@ pub struct InputFit {
     /// The views it saw, by number.
     pub views: Vec<usize>,
     /// Its Gaussians, a power of two of them in the order of their tree.
-    pub gaussians: Cloud,
+    pub gaussians: Gaussians,
     /// The same Gaussians, one by one, after gradient steps towards all views of the object: what the fit should have been.
     /// Unlike Gaussians that were made otherwise, they differ from it only where the few views were not enough.
-    pub mended: Cloud,
+    pub mended: Gaussians,
 }
 
 impl InputFit {

@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 use std::io::Cursor;
 use std::path::Path;
 
-use freerange_gaussians::{Cloud, channel};
+use freerange_gaussians::{Gaussians, channel};
 use freerange_scene::camera::{Camera, View, ViewSets};
 use glam::{DMat3, DMat4, DVec4};
 use half::f16;
@@ -71,7 +71,7 @@ pub struct Metadata {
 }
 
 /// `KEY.cameras.json`. Axes are OpenCV's (x right, y down, z forward), the world is the canonical frame (+z up, object
-/// inside the sphere of radius 0.5), pixel centres lie at +0.5.
+/// inside the sphere of radius 0.5), pixel centers lie at +0.5.
 #[derive(serde::Serialize, serde::Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Cameras {
@@ -148,7 +148,7 @@ pub fn is_key(key: &str) -> bool {
 /// [`DataError::Sample`] for whatever [`Shards`](crate::Shards) would refuse to read.
 pub fn encode(
     object: &Object,
-    leaves: Option<&Cloud>,
+    leaves: Option<&Gaussians>,
     metadata: &Metadata,
     format: ImageFormat,
     shard: &Path,
@@ -195,8 +195,8 @@ pub fn encode(
     Ok(entries)
 }
 
-fn encode_gaussians(object: &Object, leaves: Option<&Cloud>, place: EntryOfShard) -> Result<Vec<u8>, DataError> {
-    let bytes_of = |cloud: &Cloud| -> Vec<u8> { cloud.rows().iter().flat_map(|v| v.to_le_bytes()).collect() };
+fn encode_gaussians(object: &Object, leaves: Option<&Gaussians>, place: EntryOfShard) -> Result<Vec<u8>, DataError> {
+    let bytes_of = |cloud: &Gaussians| -> Vec<u8> { cloud.rows().iter().flat_map(|v| v.to_le_bytes()).collect() };
     let mut tensors = Vec::with_capacity(object.slices.len() + 1);
     for (&depth, cloud) in &object.slices {
         if depth > MAX_DEPTH || cloud.len() != 1 << depth {
@@ -335,7 +335,7 @@ pub(crate) fn decode_slices(
     bytes: &[u8],
     depths: &[u32],
     place: EntryOfShard,
-) -> Result<BTreeMap<u32, Cloud>, DataError> {
+) -> Result<BTreeMap<u32, Gaussians>, DataError> {
     let tensors = SafeTensors::deserialize(bytes).map_err(|e| place.error("a safetensors file", e))?;
     depths
         .iter()
@@ -353,7 +353,7 @@ pub(crate) fn decode_slices(
 }
 
 /// Of `KEY.gaussians.safetensors` the Gaussians before the tree, where they are kept.
-pub(crate) fn decode_leaves(bytes: &[u8], place: EntryOfShard) -> Result<Option<Cloud>, DataError> {
+pub(crate) fn decode_leaves(bytes: &[u8], place: EntryOfShard) -> Result<Option<Gaussians>, DataError> {
     let tensors = SafeTensors::deserialize(bytes).map_err(|e| place.error("a safetensors file", e))?;
     tensors.tensor(LEAVES).ok().map(|tensor| cloud(&tensor, LEAVES, None, place)).transpose()
 }
@@ -384,7 +384,12 @@ pub(crate) fn decode_fits(
 }
 
 /// A tensor `[rows, 14]` of finite f16; where no number of rows is given, any power of two.
-fn half_cloud(tensors: &SafeTensors, name: &str, rows: Option<usize>, place: EntryOfShard) -> Result<Cloud, DataError> {
+fn half_cloud(
+    tensors: &SafeTensors,
+    name: &str,
+    rows: Option<usize>,
+    place: EntryOfShard,
+) -> Result<Gaussians, DataError> {
     let tensor = tensors.tensor(name).map_err(|_| place.error(format!("tensor {name}"), "none"))?;
     let fits = matches!(tensor.shape(), &[n, channel::COUNT]
         if rows.map_or(n.is_power_of_two() && n <= 1 << MAX_DEPTH, |rows| rows == n));
@@ -394,13 +399,13 @@ fn half_cloud(tensors: &SafeTensors, name: &str, rows: Option<usize>, place: Ent
         return Err(place.error(format!("tensor {name} of F16 [{rows}, {}]", channel::COUNT), found));
     }
     let values = tensor.data().as_chunks::<2>().0.iter().map(|b| f16::from_le_bytes(*b).to_f32());
-    let cloud = Cloud::from_rows(values.collect());
+    let cloud = Gaussians::from_rows(values.collect());
     cloud.check_finite().map_err(|e| place.error(format!("finite numbers in tensor {name}"), e))?;
     Ok(cloud)
 }
 
 /// A tensor `[rows, 14]` of finite f32; any number of rows where none is given.
-fn cloud(tensor: &TensorView, name: &str, rows: Option<usize>, place: EntryOfShard) -> Result<Cloud, DataError> {
+fn cloud(tensor: &TensorView, name: &str, rows: Option<usize>, place: EntryOfShard) -> Result<Gaussians, DataError> {
     let fits = matches!(tensor.shape(), &[n, channel::COUNT] if rows.is_none_or(|rows| rows == n));
     if tensor.dtype() != Dtype::F32 || !fits {
         let found = format!("{:?} {:?}", tensor.dtype(), tensor.shape());
@@ -408,7 +413,7 @@ fn cloud(tensor: &TensorView, name: &str, rows: Option<usize>, place: EntryOfSha
         return Err(place.error(format!("tensor {name} of F32 [{rows}, {}]", channel::COUNT), found));
     }
     let values = tensor.data().as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b));
-    let cloud = Cloud::from_rows(values.collect());
+    let cloud = Gaussians::from_rows(values.collect());
     cloud.check_finite().map_err(|e| place.error(format!("finite numbers in tensor {name}"), e))?;
     Ok(cloud)
 }

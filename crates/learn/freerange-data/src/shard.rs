@@ -1,4 +1,4 @@
-//! Shards: tar files in the WebDataset layout, whose neighbouring entries `KEY.*` make one object.
+//! Shards: tar files in the WebDataset layout, whose neighboring entries `KEY.*` make one object.
 //!
 //! Equal objects give equal bytes: entries come in a fixed order, with fixed times, owners and modes.
 
@@ -7,7 +7,7 @@ use std::fs::File;
 use std::io::{BufReader, Cursor, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_util::IoError;
 
 use crate::sample::{self, CAMERAS, EntryOfShard, GAUSSIANS, MAX_VIEWS, METADATA, Metadata};
@@ -28,7 +28,7 @@ pub const END: [u8; 2 * BLOCK as usize] = [0; 2 * BLOCK as usize];
 /// [`DataError::Sample`] for an object that could not be read back.
 pub fn object_bytes(
     object: &Object,
-    leaves: Option<&Cloud>,
+    leaves: Option<&Gaussians>,
     metadata: &Metadata,
     format: ImageFormat,
     shard: &Path,
@@ -98,7 +98,7 @@ impl Sample {
         sample::decode_metadata(&fetch(self.metadata)?, place)
     }
 
-    fn leaves(&self, path: &Path, mut fetch: impl Fetch) -> Result<Option<Cloud>, DataError> {
+    fn leaves(&self, path: &Path, mut fetch: impl Fetch) -> Result<Option<Gaussians>, DataError> {
         let place = EntryOfShard { shard: path, sample: &self.key, entry: GAUSSIANS };
         sample::decode_leaves(&fetch(self.gaussians)?, place)
     }
@@ -157,7 +157,7 @@ impl ObjectBytes {
     ///
     /// # Errors
     /// [`DataError::Sample`] for a broken entry.
-    pub fn leaves(&self) -> Result<Option<Cloud>, DataError> {
+    pub fn leaves(&self) -> Result<Option<Gaussians>, DataError> {
         self.sample.leaves(&self.path, self.fetch())
     }
 }
@@ -223,7 +223,7 @@ impl ShardReader {
     ///
     /// # Panics
     /// If there is no such object.
-    pub fn leaves(&self, i: usize) -> Result<Option<Cloud>, DataError> {
+    pub fn leaves(&self, i: usize) -> Result<Option<Gaussians>, DataError> {
         self.samples[i].leaves(&self.path, self.fetch()?)
     }
 

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use freerange_gaussians::{Cloud, Statistics};
+use freerange_gaussians::{Gaussians, Statistics};
 use rand::{SeedableRng, seq::SliceRandom};
 use rand_chacha::ChaCha8Rng;
 
@@ -125,7 +125,7 @@ impl Shards {
     ///
     /// # Errors
     /// As [`object`](ObjectSource::object).
-    pub fn leaves(&self, index: u64) -> Result<Option<Cloud>, DataError> {
+    pub fn leaves(&self, index: u64) -> Result<Option<Gaussians>, DataError> {
         self.bytes(index)?.leaves()
     }
 

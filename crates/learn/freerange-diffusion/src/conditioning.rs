@@ -36,9 +36,9 @@ fn resized(view: &View, w: u32, h: u32) -> View {
 /// The posed images as the image encoder takes them.
 #[derive(Clone, Debug)]
 pub struct Conditioning {
-    /// `[b, views, h, w, channels]`: colour composited on white, then alpha where the encoder has four channels.
+    /// `[b, views, h, w, channels]`: color composited on white, then alpha where the encoder has four channels.
     pub images: Tensor<5>,
-    /// `[b, views, rows, columns, 6]`, one ray per patch centre.
+    /// `[b, views, rows, columns, 6]`, one ray per patch center.
     pub plucker: Tensor<5>,
     /// `[b, views, h, w, 6]`, one ray per pixel, for a pixel-aligned model.
     pub rays: Option<Tensor<5>>,

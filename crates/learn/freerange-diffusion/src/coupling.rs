@@ -21,7 +21,7 @@ pub enum Coupling {
 }
 
 impl Coupling {
-    /// Rearranges `noise` (`[n, 14]`) in place for `data` (`[n, 14]`, normalised, in tree order; `n` a power of two).
+    /// Rearranges `noise` (`[n, 14]`) in place for `data` (`[n, 14]`, normalized, in tree order; `n` a power of two).
     pub fn pair(self, noise: &mut [f32], data: &[f32]) {
         assert_eq!(noise.len(), data.len(), "noise and data have the same shape");
         if self == Self::Tree {
@@ -30,7 +30,7 @@ impl Coupling {
     }
 
     /// Rearranges `noise` (`[n, 14]`, `n` a power of two) in place for sampling, where no data is known: the tokens
-    /// get neighbouring noise vectors, as they do in training.
+    /// get neighboring noise vectors, as they do in training.
     pub fn group(self, noise: &mut [f32]) {
         if self == Self::Tree {
             let rows: Vec<Row> = noise.as_chunks().0.to_vec();

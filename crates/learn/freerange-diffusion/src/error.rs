@@ -46,7 +46,7 @@ pub enum FlowError {
     /// The caller asked to stop.
     #[error("cancelled")]
     Cancelled,
-    /// The rasteriser refused its input.
+    /// The rasterizer refused its input.
     #[error(transparent)]
     Raster(#[from] freerange_raster::RasterError),
     /// The model or its checkpoint.

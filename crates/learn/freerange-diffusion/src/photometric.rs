@@ -7,24 +7,24 @@ use freerange_raster::{RasterConfig, rasterize};
 
 use crate::{FlowError, place::place, targets::Targets};
 
-/// Renders Gaussians given in the network's normalised parameter space, differentiably.
+/// Renders Gaussians given in the network's normalized parameter space, differentiably.
 #[derive(Clone, Debug)]
 pub struct Photometric {
     mean: Tensor<3>, // [1, 1, 14]
     std: Tensor<3>,  // [1, 1, 14]
 }
 
-/// Longest side of an image, in pixels, at which the rasteriser's screen-space blur means what it does in a viewer.
+/// Longest side of an image, in pixels, at which the rasterizer's screen-space blur means what it does in a viewer.
 const VIEWER_SIZE: f32 = 512.0;
 
 impl Photometric {
-    /// For Gaussians normalised by `normalization`, on `device`.
+    /// For Gaussians normalized by `normalization`, on `device`.
     pub fn new(normalization: &Normalization, device: &Device) -> Self {
         let row = |x: &[f32; 14]| Tensor::<1>::from_floats(*x, device).reshape([1, 1, 14]);
         Self { mean: row(&normalization.mean), std: row(&normalization.std) }
     }
 
-    /// Raw channels from normalised ones. `[b, n, 14]`
+    /// Raw channels from normalized ones. `[b, n, 14]`
     pub fn denormalize(&self, normalized: Tensor<3>) -> Tensor<3> {
         normalized * self.std.clone() + self.mean.clone()
     }
@@ -53,7 +53,7 @@ impl Photometric {
         Ok(difference.abs().reshape([b, v * h * w * 3]).mean_dim(1).reshape([b]))
     }
 
-    /// The gradient of each object's L1 with respect to its normalised Gaussians, cut off from any graph. `[b, n, 14]`
+    /// The gradient of each object's L1 with respect to its normalized Gaussians, cut off from any graph. `[b, n, 14]`
     pub fn gradient(&self, normalized: Tensor<3>, targets: &Targets) -> Result<Tensor<3>, FlowError> {
         let leaf = normalized.inner().autodiff().require_grad();
         // Each object's loss depends on its own Gaussians alone: the gradient of the sum is every gradient at once.
@@ -65,30 +65,30 @@ impl Photometric {
     /// where it lies.
     ///
     /// A Gaussian weighs in a pixel what blending gives it there. Summed over a view, these weights `w` say how much of it is
-    /// seen, and the colours they lie on what it should look like. The channels are
+    /// seen, and the colors they lie on what it should look like. The channels are
     /// - 0: the logarithm of 1 + the sum of `w` over all views, in pixels, halved;
     /// - 1: how many views see it, `w / (w + 1)` summed over views, halved;
     /// - 2: how much of what is seen lies beside the object, 0 to 1;
-    /// - 3 to 5: the object's colour there, averaged over views, less the Gaussian's own, in normalised units;
-    /// - 6 to 8: its standard deviation between views, in normalised units: large where views do not see the same surface.
+    /// - 3 to 5: the object's color there, averaged over views, less the Gaussian's own, in normalized units;
+    /// - 6 to 8: its standard deviation between views, in normalized units: large where views do not see the same surface.
     ///
     /// Where nothing is seen, these are 0.
     ///
-    /// Where its centre lies, by the pixel of each view that shows it (`model.place_channels`):
+    /// Where its center lies, by the pixel of each view that shows it (`model.place_channels`):
     /// - 9, 10: distance to the outline, positive within: least of all views, and mean, in tenths of a unit;
     /// - 11, 12: how far behind the rendered surface: least of all views, and mean, in tenths of a unit;
-    /// - 13 to 15: the photos' colours there, averaged over views that show the object, less the Gaussian's own, in normalised units;
-    /// - 16 to 18: their standard deviation between views, in normalised units;
+    /// - 13 to 15: the photos' colors there, averaged over views that show the object, less the Gaussian's own, in normalized units;
+    /// - 16 to 18: their standard deviation between views, in normalized units;
     /// - 19 to 21: the way to the outlines of the views in which it lies beside them, mean over all views, in twentieths of a unit;
-    /// - 22 to 28: of the view that sees it best, how unlike the colours are in which the others see points on its ray, 0.04, 0.02 and 0.01
-    ///   before and 0.01, 0.02 and 0.04 behind the centre, five times as much as at the centre less; and twice that at the centre;
+    /// - 22 to 28: of the view that sees it best, how unlike the colors are in which the others see points on its ray, 0.04, 0.02 and 0.01
+    ///   before and 0.01, 0.02 and 0.04 behind the center, five times as much as at the center less; and twice that at the center;
     /// - 29 to 31: the direction of that ray. Where no view sees it, all from 22 on are 0.
     pub fn observe(&self, normalized: Tensor<3>, targets: &Targets, channels: usize) -> Result<Tensor<3>, FlowError> {
         let [b, n, c] = normalized.dims();
         let [_, v, h, w, _] = targets.object.dims();
         let gaussians = self.denormalize(normalized.inner());
         let own = gaussians.clone().narrow(2, channel::COLOR.start, 3);
-        // Every view is an object of its own, so that sums are over its pixels alone. What blending is linear in, the colours,
+        // Every view is an object of its own, so that sums are over its pixels alone. What blending is linear in, the colors,
         // has as its gradient the sums of weights times whatever the images of a linear loss hold.
         let each = gaussians.clone().unsqueeze_dim::<4>(1).repeat_dim(1, v).reshape([b * v, n, c]);
         let cameras: Vec<_> = targets.cameras.iter().flatten().map(|&camera| vec![camera]).collect();

@@ -1,4 +1,4 @@
-//! Where each Gaussian lies with respect to what views show: their outlines, the surface that is rendered, colours that agree.
+//! Where each Gaussian lies with respect to what views show: their outlines, the surface that is rendered, colors that agree.
 //!
 //! Computed on the host, on all its threads, from pictures that are small: on a GPU every estimate waits for it.
 
@@ -16,11 +16,11 @@ use crate::{FlowError, targets::Targets};
 const UNIT: f32 = 0.1;
 /// One unit of the way to the outlines.
 const WAY: f32 = 0.05;
-/// Where along the ray from the view that sees a Gaussian best its colour is looked for in the others.
+/// Where along the ray from the view that sees a Gaussian best its color is looked for in the others.
 const SWEEP: [f32; 6] = [-0.04, -0.02, -0.01, 0.01, 0.02, 0.04];
 
 /// The last channels of [`observe`](crate::photometric::Photometric::observe), in its order, for raw `gaussians` `[b, n, 14]`: `[b, n, 23]`.
-/// `unit` is that of colours.
+/// `unit` is that of colors.
 pub(crate) fn place(
     gaussians: Tensor<3>,
     unit: [f32; 3],
@@ -97,7 +97,7 @@ impl Seen<'_> {
         within(y, self.size[1]) * self.size[0] + within(x, self.size[0])
     }
 
-    /// Bilinear; colour times alpha, and alpha.
+    /// Bilinear; color times alpha, and alpha.
     fn sample(&self, p: DVec3) -> [f32; 4] {
         let [w, h] = self.size;
         let [x, y] = projected(&self.camera, p).map(|x| x as f32 - 0.5);
@@ -203,7 +203,7 @@ fn place_of(row: &[f32; channel::COUNT], unit: [f32; 3], views: &[Seen]) -> [f32
 /// Distance to the outline in pixels, positive within; by chamfers, within a tenth.
 fn outline(photo: &[[f32; 4]], w: usize, h: usize) -> Vec<f32> {
     const FAR: f32 = 1e4; // where there is nothing to be far from
-    let stride = w + 2; // a frame of one pixel that is far from all, so that every pixel has neighbours
+    let stride = w + 2; // a frame of one pixel that is far from all, so that every pixel has neighbors
     let pixels = || (0..h).flat_map(|y| (0..w).map(move |x| (y + 1) * stride + x + 1));
     let to = |what: bool| {
         let mut d = vec![FAR; stride * (h + 2)];
@@ -321,7 +321,7 @@ mod tests {
             assert!((found[2] - expected).abs() < 0.25 && (found[3] - expected).abs() < 0.25, "{y}: {found:?}");
         }
         assert_eq!(at(0.1)[13..], [0.0; 10], "no view sees it");
-        // Before the surface by as much along the ray of the view that sees it best, the colours agree behind it.
+        // Before the surface by as much along the ray of the view that sees it best, the colors agree behind it.
         let (before, on) = (at(-0.02), at(0.0));
         let least = |found: &[f32; PLACE]| (13..19).min_by(|&a, &b| found[a].total_cmp(&found[b])).unwrap();
         assert_eq!(SWEEP[least(&before) - 13], 0.02, "{before:?}");
@@ -329,7 +329,7 @@ mod tests {
         assert!(on[13..19].iter().all(|&x| x > 0.0), "{on:?}");
         let ray = DVec3::new(on[20].into(), on[21].into(), on[22].into());
         assert!((ray.length() - 1.0).abs() < 1e-5 && ray.y > 0.9, "{ray}");
-        // In units of the colours; their mean on the surface is that of the plane.
+        // In units of the colors; their mean on the surface is that of the plane.
         let deviation = |found: &[f32; PLACE]| found[7] * 0.5;
         assert!(deviation(&on) < 0.06 && deviation(&at(-0.1)) > 2.0 * deviation(&on), "{on:?}");
         let plane = (0.5 + 120.0 / 255.0 * (25.0f32 * 0.03).sin() - 0.5) / 0.5;

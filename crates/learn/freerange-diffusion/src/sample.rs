@@ -12,7 +12,7 @@ mod flow;
 mod refiner;
 
 use burn::tensor::Tensor;
-use freerange_gaussians::{Cloud, channel};
+use freerange_gaussians::{Gaussians, channel};
 pub use freerange_util::Background;
 
 pub use self::{
@@ -39,17 +39,17 @@ impl Estimate<'_> {
     ///
     /// # Errors
     /// If the values cannot be read back.
-    pub fn clouds(&self) -> Result<Vec<Cloud>, FlowError> {
+    pub fn clouds(&self) -> Result<Vec<Gaussians>, FlowError> {
         clouds(self.raw.clone())
     }
 }
 
 /// Raw channels as Gaussians. `[b, n, 14]` to `[b]`
-fn clouds(raw: Tensor<3>) -> Result<Vec<Cloud>, FlowError> {
+fn clouds(raw: Tensor<3>) -> Result<Vec<Gaussians>, FlowError> {
     let row = raw.dims()[1] * channel::COUNT;
     let values = raw.into_data().try_to_vec::<f32>().map_err(FlowError::device)?;
     let cloud = |rows: &[f32]| {
-        let mut cloud = Cloud::from_rows(rows.to_vec());
+        let mut cloud = Gaussians::from_rows(rows.to_vec());
         cloud.canonicalize_rotations();
         cloud
     };

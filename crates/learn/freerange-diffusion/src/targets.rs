@@ -46,7 +46,7 @@ impl Images {
         })
     }
 
-    /// The images in front of one background colour per object: what renders are compared with.
+    /// The images in front of one background color per object: what renders are compared with.
     pub fn on(&self, backgrounds: &[[f32; 3]]) -> Targets {
         let (objects, views) = (self.cameras.len(), self.cameras.first().map_or(0, Vec::len));
         assert_eq!(backgrounds.len(), objects, "one background per object");
@@ -70,7 +70,7 @@ pub struct Targets {
     pub backgrounds: Vec<Vec<[f32; 3]>>,
     /// `[objects, views, h, w, 3]`, composited on the backgrounds.
     pub images: Tensor<5>,
-    /// The object in them: colour times alpha, and alpha. `[objects, views, h, w, 4]`
+    /// The object in them: color times alpha, and alpha. `[objects, views, h, w, 4]`
     pub object: Tensor<5>,
 }
 

@@ -8,7 +8,7 @@ use freerange_diffusion::{
     sample::{classifier_free, integrate},
     settings::Settings,
 };
-use freerange_gaussians::{Cloud, Normalization};
+use freerange_gaussians::{Gaussians, Normalization};
 use freerange_vectors::{Vectors, assert_close, json};
 
 fn load(name: &str) -> Vectors {
@@ -58,14 +58,14 @@ fn the_bound_on_the_denominator_only_acts_near_the_data() {
 }
 
 #[test]
-fn normalisation() {
+fn normalization() {
     let v = load("fm.safetensors");
     let row = |name: &str| v.floats(name).to_vec().try_into().unwrap();
     let normalization = Normalization::new(row("in/mean"), row("in/std")).unwrap();
     let z1 = v.floats("in/z1");
-    let found = normalization.normalize(&Cloud::from_rows(z1.to_vec()));
-    assert_close("normalised", &found, v.floats("out/z1_normalised"), 1e-5);
-    assert_close("denormalised", normalization.denormalize(z1).rows(), v.floats("out/z1_denormalised"), 1e-5);
+    let found = normalization.normalize(&Gaussians::from_rows(z1.to_vec()));
+    assert_close("normalized", &found, v.floats("out/z1_normalised"), 1e-5);
+    assert_close("denormalized", normalization.denormalize(z1).rows(), v.floats("out/z1_denormalised"), 1e-5);
 }
 
 #[test]

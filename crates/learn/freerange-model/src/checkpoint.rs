@@ -1,7 +1,7 @@
 //! A trained model in one `.safetensors` file: weights, and everything needed to use them.
 //!
 //! Tensors have PyTorch-like names (`dit.*`, `encoder.*`); the header's metadata hold the format's version, the
-//! configuration, the normalisation, the gradient's RMS, the tree depth and the provenance as JSON. Frozen DINOv2
+//! configuration, the normalization, the gradient's RMS, the tree depth and the provenance as JSON. Frozen DINOv2
 //! weights are named, with their hash, and not stored.
 
 use std::{
@@ -37,7 +37,7 @@ pub struct Checkpoint {
     pub config: ModelConfig,
     /// The network.
     pub model: FreeRange,
-    /// How Gaussians were normalised in training.
+    /// How Gaussians were normalized in training.
     pub normalization: Normalization,
     /// RMS per channel of the photometric gradients seen in training; the input gradient is divided by it.
     pub gradient_rms: [f32; channel::COUNT],

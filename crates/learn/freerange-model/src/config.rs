@@ -179,7 +179,7 @@ impl ModelConfig {
         (self.image_size / self.encoder.patch_size()) as usize
     }
 
-    /// Width of an image token before the input projection: features, position, mean colour, Plücker ray.
+    /// Width of an image token before the input projection: features, position, mean color, Plücker ray.
     pub fn image_token_width(&self) -> usize {
         self.encoder.features() + self.position_features + 3 + PLUCKER
     }

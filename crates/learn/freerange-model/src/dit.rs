@@ -52,7 +52,7 @@ pub struct Feedback {
     /// The photometric gradient at the noisy Gaussians or at an estimate of the clean ones, each channel scaled to unit
     /// RMS. `[b, n, 14]`
     pub gradient: Option<Tensor<3>>,
-    /// An earlier estimate of the clean Gaussians, normalised. `[b, n, 14]`
+    /// An earlier estimate of the clean Gaussians, normalized. `[b, n, 14]`
     pub estimate: Option<Tensor<3>>,
     /// What the input views show of that estimate. `[b, n, 9]`
     pub observation: Option<Tensor<3>>,
@@ -455,12 +455,12 @@ impl Dit {
 
     /// Predicts the clean Gaussians from noisy ones.
     ///
-    /// - `noisy`: `[b, n, 14]`, normalised; `n` a multiple of `gaussians_per_token`
+    /// - `noisy`: `[b, n, 14]`, normalized; `n` a multiple of `gaussians_per_token`
     /// - `feedback`: what is known besides; of what the model is configured for
     /// - `image_tokens`: `[b, m, image_channels]`; zeros for the unconditional prediction
     /// - `t`: `[b]`, 0 is noise, 1 is data
     ///
-    /// Returns the clean Gaussians, normalised, `[b, n, 14]`.
+    /// Returns the clean Gaussians, normalized, `[b, n, 14]`.
     ///
     /// # Panics
     /// If shapes do not fit each other, or something is fed back to a model without channels for it.

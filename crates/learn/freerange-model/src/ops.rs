@@ -148,9 +148,9 @@ pub(crate) mod reference {
     }
 
     pub fn modulated_norm(x: Tensor<3>, shift: Tensor<2>, scale: Tensor<2>) -> Tensor<3> {
-        let centred = x.clone() - x.mean_dim(2);
-        let variance = centred.clone().square().mean_dim(2);
-        let y = centred / (variance + EPS).sqrt();
+        let centerd = x.clone() - x.mean_dim(2);
+        let variance = centerd.clone().square().mean_dim(2);
+        let y = centerd / (variance + EPS).sqrt();
         y * (scale + 1.0).unsqueeze_dim::<3>(1) + shift.unsqueeze_dim::<3>(1)
     }
 

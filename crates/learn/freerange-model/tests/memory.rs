@@ -30,7 +30,7 @@ fn status(name: &str) -> u64 {
     line.trim_start_matches(':').trim().trim_end_matches(" kB").parse::<u64>().unwrap() * 1024
 }
 
-/// One training step without an optimiser; prints by how much memory rose at most.
+/// One training step without an optimizer; prints by how much memory rose at most.
 #[test]
 #[ignore = "a child process of the other test"]
 fn child() {

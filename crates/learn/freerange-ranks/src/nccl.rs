@@ -212,7 +212,7 @@ fn card(device: &Device) -> Result<usize, TrainError> {
 
 /// Says where NCCL was looked for, if it is not there.
 fn loaded() -> Result<(), TrainError> {
-    // SAFETY: loads the library, whose initialisers are NVIDIA's.
+    // SAFETY: loads the library, whose initializers are NVIDIA's.
     if unsafe { sys::is_culib_present() } {
         return Ok(());
     }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use freerange_data::{InputFit, Object};
-use freerange_gaussians::{Cloud, Normalization, channel};
+use freerange_gaussians::{Gaussians, Normalization, channel};
 use freerange_model::ModelConfig;
 use freerange_scene::camera::{Similarity, View};
 use glam::DVec3;
@@ -24,7 +24,7 @@ use freerange_diffusion::{
     targets::{Images, Targets},
 };
 
-/// A colour for what lies behind the object.
+/// A color for what lies behind the object.
 pub fn draw_background(rng: &mut ChaCha8Rng) -> [f32; 3] {
     std::array::from_fn(|_| rng.random())
 }
@@ -32,7 +32,7 @@ pub fn draw_background(rng: &mut ChaCha8Rng) -> [f32; 3] {
 /// Everything one training step needs.
 #[derive(Clone, Debug)]
 pub struct Batch {
-    /// Clean, normalised Gaussians z_1. `[b, n, 14]`
+    /// Clean, normalized Gaussians z_1. `[b, n, 14]`
     pub data: Tensor<3>,
     /// Noise, paired with them. `[b, n, 14]`
     pub noise: Tensor<3>,
@@ -181,7 +181,7 @@ impl<'a> Rows<'a> {
             None => object.slice(depth)?,
         };
         let order = symmetry.order(fit.map_or(slice, |fit| &fit.gaussians)); // both have it, one by one
-        let seen_so = |cloud: &Cloud| symmetry.gaussians(cloud).select(order.iter().copied());
+        let seen_so = |cloud: &Gaussians| symmetry.gaussians(cloud).select(order.iter().copied());
         let mut slice = match fit {
             None if loss.random_patches => seen_so(slice).shuffled(rng),
             _ => seen_so(slice),

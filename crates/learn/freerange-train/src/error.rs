@@ -99,7 +99,7 @@ pub enum TrainError {
     /// The caller asked to stop.
     #[error("cancelled")]
     Cancelled,
-    /// The rasteriser refused its input.
+    /// The rasterizer refused its input.
     #[error(transparent)]
     Raster(#[from] freerange_raster::RasterError),
     /// The model or its checkpoint.

@@ -1,7 +1,7 @@
 //! AdamW (Loshchilov and Hutter 2019), the joint norm of gradients, and the moving average of the weights.
 //!
 //! On the CPU everything that happens to a parameter in a step happens in one pass over memory: passes are what an
-//! optimiser costs.
+//! optimizer costs.
 
 #[cfg(test)]
 mod tests;
@@ -28,7 +28,7 @@ use crate::{
 /// What is added to the root of the second moment.
 const EPSILON: f32 = 1e-8;
 
-/// The optimiser's state.
+/// The optimizer's state.
 pub(crate) struct AdamW {
     moments: Vec<Option<[Tensor<1>; 2]>>, // as in `Flat`; none of parameters that never had a gradient
 }

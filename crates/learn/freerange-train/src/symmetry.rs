@@ -1,8 +1,8 @@
 //! Other objects that an object of the training data makes as well: turned by quarters about the upright axis, mirrored,
-//! its colours exchanged. Gaussians, photos and what was fitted to them change together, and exactly: a fit of the
+//! its colors exchanged. Gaussians, photos and what was fitted to them change together, and exactly: a fit of the
 //! mirrored photos is the mirrored fit.
 
-use freerange_gaussians::{Cloud, channel};
+use freerange_gaussians::{Gaussians, channel};
 use freerange_scene::camera::{Camera, View};
 use glam::{DMat3, DMat4, DVec3};
 use image::{RgbaImage, imageops::flip_horizontal_in_place};
@@ -18,7 +18,7 @@ pub struct Symmetry {
     axes: [usize; 3],
     /// Whether new axis i points against the old one.
     flipped: [bool; 3],
-    /// New colour channel i is the old channel `colors[i]`.
+    /// New color channel i is the old channel `colors[i]`.
     colors: [usize; 3],
 }
 
@@ -50,7 +50,7 @@ impl Symmetry {
     }
 
     /// The Gaussians so changed, one by one.
-    pub fn gaussians(self, cloud: &Cloud) -> Cloud {
+    pub fn gaussians(self, cloud: &Gaussians) -> Gaussians {
         let mut cloud = cloud.clone();
         if self == Self::IDENTITY {
             return cloud;
@@ -73,7 +73,7 @@ impl Symmetry {
 
     /// In which order Gaussians (a power of two, in that of their tree) are in tree order afterwards: of two halves the one
     /// with the smaller coordinate stays first.
-    pub fn order(self, cloud: &Cloud) -> Vec<usize> {
+    pub fn order(self, cloud: &Gaussians) -> Vec<usize> {
         let turned_round: [bool; 3] =
             std::array::from_fn(|old| (0..3).any(|new| self.axes[new] == old && self.flipped[new]));
         let mut order: Vec<usize> = (0..cloud.len()).collect();
@@ -129,7 +129,7 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
 
     /// Gaussians of all shapes, in tree order.
-    fn example(n: usize) -> Cloud {
+    fn example(n: usize) -> Gaussians {
         let mut rng = ChaCha8Rng::seed_from_u64(4);
         let mut rows: Vec<f32> = (0..n)
             .flat_map(|_| {
@@ -143,7 +143,7 @@ mod tests {
             })
             .collect();
         Coupling::Tree.group(&mut rows);
-        Cloud::from_rows(rows)
+        Gaussians::from_rows(rows)
     }
 
     fn all() -> Vec<Symmetry> {
@@ -163,7 +163,7 @@ mod tests {
         let cloud = example(32);
         let mut camera = Camera::look_at(DVec3::new(1.1, -0.9, 0.7), DVec3::ZERO, DVec3::Z, 0.9, 24, 20);
         camera.cx += 1.25;
-        let photo = |cloud: &Cloud, camera: Camera| {
+        let photo = |cloud: &Gaussians, camera: Camera| {
             let drawn = reference::render(cloud.rows(), &camera, [0.0; 3], &RasterConfig::default());
             let pixels = drawn.rgb.chunks(3).zip(&drawn.alpha);
             let bytes = pixels.flat_map(|(c, a)| [c[0], c[1], c[2], *a].map(|v| (v * 255.0).round() as u8)).collect();

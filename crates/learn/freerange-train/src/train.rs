@@ -16,7 +16,7 @@ use freerange_diffusion::{
 /// The loss of a batch and its terms, each averaged over the batch.
 #[derive(Clone, Debug)]
 pub struct Losses {
-    /// What is minimised: `L_FM + w(t) (R_Held + R_Seen)`. `[1]`
+    /// What is minimized: `L_FM + w(t) (R_Held + R_Seen)`. `[1]`
     pub total: Tensor<1>,
     /// The flow-matching loss L_FM. `[1]`
     pub flow: Tensor<1>,

@@ -39,7 +39,7 @@ pub struct Trainer {
     config: TrainConfig,
     described: serde_json::Value, // the configuration, with how objects are made
     device: Device,               // the plain one
-    model: Option<FreeRange>,     // without the frozen encoder; none only while the optimiser changes it
+    model: Option<FreeRange>,     // without the frozen encoder; none only while the optimizer changes it
     frozen: Option<Dinov2>,
     average: Weights,
     optimizer: AdamW,

@@ -4,7 +4,7 @@ use std::{ops::ControlFlow, sync::Arc};
 
 use burn::tensor::{Device, Tensor};
 use freerange_data::{Object, ObjectSource};
-use freerange_gaussians::{Cloud, channel};
+use freerange_gaussians::{Gaussians, channel};
 use freerange_model::{Checkpoint, FreeRange, ModelConfig};
 use freerange_optim::psnr_over_white;
 use freerange_raster::{RasterConfig, render};
@@ -121,7 +121,7 @@ const COMPARED: usize = 8;
 const PICTURED: (usize, usize) = (4, 4);
 
 /// The first views of an object above the same of a sample, over white.
-fn picture(sample: &Cloud, views: &[View]) -> Result<RgbaImage, TrainError> {
+fn picture(sample: &Gaussians, views: &[View]) -> Result<RgbaImage, TrainError> {
     const WHITE: [f32; 3] = [1.0; 3];
     let (mut truth, mut renders) = (Vec::new(), Vec::new());
     for View { camera, image, .. } in views.iter().take(PICTURED.1) {
@@ -208,10 +208,10 @@ impl Validation {
         config: &TrainConfig,
         stage: &Stage,
         inputs: &[View],
-        fit: Option<&Cloud>,
+        fit: Option<&Gaussians>,
         device: &Device,
         interrupted: &dyn Fn() -> bool,
-    ) -> Result<Cloud, TrainError> {
+    ) -> Result<Gaussians, TrainError> {
         // The size that objects come in is the size that they are sampled and compared at.
         let lod_depth = (!config.model.kind.one_pass()).then_some(stage.depth);
         let go_on = |_: &Estimate| if interrupted() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) };
@@ -254,4 +254,4 @@ impl Validation {
 }
 
 /// Input views, views to compare with, and the fit to start from.
-type Task = (Vec<View>, Vec<View>, Option<Cloud>);
+type Task = (Vec<View>, Vec<View>, Option<Gaussians>);

@@ -63,7 +63,7 @@ impl Weights {
 ///
 /// # Errors
 /// [`TrainError::Config`] where there is none, or where one differs from the first in its architecture, its tree depth or
-/// in how its Gaussians were normalised; names the file.
+/// in how its Gaussians were normalized; names the file.
 pub fn average(checkpoints: Vec<(PathBuf, Checkpoint)>) -> Result<Checkpoint, TrainError> {
     let names: Vec<String> = checkpoints.iter().map(|(path, _)| path.display().to_string()).collect();
     let count = checkpoints.len() as f32;
@@ -80,7 +80,7 @@ pub fn average(checkpoints: Vec<(PathBuf, Checkpoint)>) -> Result<Checkpoint, Tr
         };
         alike(other.config.architecture() == mean.config.architecture(), "architecture")?;
         alike(other.depth == mean.depth, "depth of the tree")?;
-        alike(other.normalization == mean.normalization, "normalisation of Gaussians")?;
+        alike(other.normalization == mean.normalization, "normalization of Gaussians")?;
         for (sum, weights) in sums.iter_mut().zip(Weights::of(&other.model).0) {
             *sum = sum.clone() + weights;
         }

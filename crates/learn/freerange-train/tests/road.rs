@@ -11,7 +11,7 @@ use freerange_diffusion::{
     sample::{Estimate, FlowConfig, FlowSampler, Refiner, RefinerConfig},
     targets::Targets,
 };
-use freerange_gaussians::{Cloud, Normalization, channel};
+use freerange_gaussians::{Gaussians, Normalization, channel};
 use freerange_model::Checkpoint;
 use freerange_optim::tree_slice;
 use freerange_raster::metrics::psnr;
@@ -106,7 +106,7 @@ fn go(_: &Estimate<'_>) -> ControlFlow<()> {
 }
 
 /// Samples of `objects` from noise: object by object, and of each one seed after the other.
-fn sample(checkpoint: &Checkpoint, objects: &[&[View]], config: &FlowConfig, seeds: &[u64]) -> Vec<Cloud> {
+fn sample(checkpoint: &Checkpoint, objects: &[&[View]], config: &FlowConfig, seeds: &[u64]) -> Vec<Gaussians> {
     FlowSampler { checkpoint, config, device: &Device::flex() }.sample(objects, seeds, go).unwrap()
 }
 
@@ -186,7 +186,8 @@ fn one_object_is_learned_sampled_and_rendered() {
 
     // Another batch: two objects (the second sees other views), one seed.
     let both = sample(&checkpoint, &[inputs, unseen], &config.sample, &[5]);
-    let worst = |a: &Cloud, b: &Cloud| a.rows().iter().zip(b.rows()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    let worst =
+        |a: &Gaussians, b: &Gaussians| a.rows().iter().zip(b.rows()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
     assert_eq!(both.len(), 2);
     let off = worst(&both[0], &clouds[0]);
     assert!(off < 1e-2, "the same seed in another batch gives the same sample, up to rounding: off by {off}");
@@ -405,7 +406,7 @@ fn a_fit_is_refined() {
     for (i, view) in object.views.iter().enumerate() {
         if fit.views.contains(&i) { inputs.push(view.clone()) } else { unseen.push(view.clone()) }
     }
-    let refine = |proposals: &[Cloud], passes, retokenize_every| {
+    let refine = |proposals: &[Gaussians], passes, retokenize_every| {
         let config = &RefinerConfig { passes, retokenize_every, ..config.refiner.clone().unwrap() };
         let mut steps = 0;
         let found =
@@ -427,7 +428,7 @@ fn a_fit_is_refined() {
     );
 
     // To group the Gaussians into tokens again is to begin again with them as the proposal.
-    let one = |proposal: &Cloud, passes, every| refine(std::slice::from_ref(proposal), passes, every).remove(0);
+    let one = |proposal: &Gaussians, passes, every| refine(std::slice::from_ref(proposal), passes, every).remove(0);
     let half = one(&own, 2, 0);
     assert_ne!(tree_slice(&half, 6).unwrap(), half, "refinement moves Gaussians past each other");
     assert_eq!(one(&half, 2, 0), one(&own, 4, 2));

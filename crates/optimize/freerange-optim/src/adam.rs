@@ -13,7 +13,7 @@ const EPSILON: f32 = 1e-15;
 pub(crate) type ChannelRates = [f32; channel::COUNT];
 
 impl Rates {
-    /// The rate of every channel, `mean` being that of the centres.
+    /// The rate of every channel, `mean` being that of the centers.
     pub(crate) fn by_channel(&self, mean: f64) -> ChannelRates {
         let mut out = [0.0; channel::COUNT];
         out[channel::MEAN].fill(mean as f32);
@@ -50,7 +50,7 @@ fn update(
     }
 }
 
-/// The optimiser's state: first and second moments of the gradients.
+/// The optimizer's state: first and second moments of the gradients.
 #[derive(Default)]
 pub(crate) struct Adam {
     first: Vec<f32>,  // [n, 14]

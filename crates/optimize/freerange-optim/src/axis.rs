@@ -2,7 +2,7 @@
 
 use std::{f64::consts::TAU, ops::ControlFlow};
 
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_scene::camera::{Camera, View};
 use glam::{DMat4, DVec3};
 
@@ -74,7 +74,7 @@ pub fn axis_steps(config: &QuickFitConfig) -> usize {
 }
 
 /// The axis about which an object may be turned and keeps its outlines, as far as photos of it tell: none where they contradict it by more than
-/// `most` (see [`FoundAxis::contradiction`]), or no axis suits their outlines. Colours need not be the same all around. `views` lie in the
+/// `most` (see [`FoundAxis::contradiction`]), or no axis suits their outlines. Colors need not be the same all around. `views` lie in the
 /// canonical frame, and may all be from one side; `own` is a [`quick_fit`](crate::quick_fit) of them.
 ///
 /// What lies within all outlines, and within all turned ones, has to fill the outlines. Axes through the middle of the hull, in all directions,
@@ -86,7 +86,7 @@ pub fn axis_steps(config: &QuickFitConfig) -> usize {
 /// Those of [`fit`](crate::fit()).
 pub fn find_axis(
     views: &[View],
-    own: &Cloud,
+    own: &Gaussians,
     config: &QuickFitConfig,
     most: f64,
     seed: u64,
@@ -118,8 +118,9 @@ pub fn find_axis(
     let Some((_, mut axis)) = best.filter(|(uncovered, _)| *uncovered <= UNCOVERED) else { return Ok(None) };
 
     let pictures = Targets::new(views, Some(PICTURE))?;
-    let put =
-        |cloud: &Cloud, axis: Axis, reach| place(axis, reach, |axis| difference(cloud, &outlines, Some(axis), false));
+    let put = |cloud: &Gaussians, axis: Axis, reach| {
+        place(axis, reach, |axis| difference(cloud, &outlines, Some(axis), false))
+    };
     let before = difference::<Axis>(own, &pictures, None, false)?;
     (_, axis) = put(own, axis, [0.04, 0.004])?;
     let both = Evidence { views, outlines: turned(views, &axis) };
@@ -154,10 +155,10 @@ mod tests {
 
     const AXIS: Axis = Axis { point: DVec3::new(0.04, -0.02, 0.0), direction: DVec3::new(0.48, 0.6, 0.64) };
 
-    /// A vase of rings, each Gaussian of a colour of its own: all around its axis or, where it is `half`, on one side of it.
-    fn vase(half: bool) -> Cloud {
+    /// A vase of rings, each Gaussian of a color of its own: all around its axis or, where it is `half`, on one side of it.
+    fn vase(half: bool) -> Gaussians {
         let mut rng = ChaCha8Rng::seed_from_u64(5);
-        let mut cloud = Cloud::default();
+        let mut cloud = Gaussians::default();
         let side = AXIS.direction.any_orthonormal_vector();
         for (height, radius) in
             [(-0.3, 0.12), (-0.2, 0.2), (-0.1, 0.24), (0.0, 0.22), (0.1, 0.14), (0.2, 0.08), (0.3, 0.12)]
@@ -177,7 +178,7 @@ mod tests {
         cloud
     }
 
-    fn photos(cloud: &Cloud) -> Vec<View> {
+    fn photos(cloud: &Gaussians) -> Vec<View> {
         cameras(4, 64, 0.3).iter().map(|c| photograph(cloud, c)).collect()
     }
 

@@ -82,7 +82,7 @@ impl Default for FitConfig {
             growth_start: 500,
             growth_stop: 5.0 / 6.0,
             growth: 1.05,
-            // The published rates are 1.6e-4 times the extent of the cameras for the centres, also down to a hundredth,
+            // The published rates are 1.6e-4 times the extent of the cameras for the centers, also down to a hundredth,
             // and 5e-3 for the sizes, for 30,000 steps. Fits of small objects in 100 to 3000 steps gain most from more:
             // 1 to 2 dB on scanned ones, and their slices as much.
             rates: Rates { mean: 3e-3, scale: 1e-2, rotation: 1e-3, opacity: 0.05, color: 2.5e-3 },
@@ -105,7 +105,7 @@ impl Default for FitConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct RefineConfig {
-    /// Optimisation steps; each one looks at one view, and at one picture of the hold.
+    /// Optimization steps; each one looks at one view, and at one picture of the hold.
     pub steps: usize,
     /// Number of Gaussians at the end; a cloud that has more keeps its number.
     pub gaussians: usize,

@@ -11,7 +11,7 @@ pub enum FitError {
     NoViews,
     /// There is nothing to refine.
     #[error("the cloud to start from holds no Gaussians")]
-    EmptyCloud,
+    NoGaussians,
     /// A view cannot be used.
     #[error("view {name:?}: {field}: expected {expected}, found {found}")]
     View {
@@ -27,7 +27,7 @@ pub enum FitError {
     /// A configuration value is impossible.
     #[error(transparent)]
     Config(#[from] Invalid),
-    /// The optimisation left the finite numbers.
+    /// The optimization left the finite numbers.
     #[error("step {step}: {what} is not finite; smaller learning rates may help")]
     Diverged {
         /// The step, counted from 0.
@@ -38,7 +38,7 @@ pub enum FitError {
     /// The cloud to start from.
     #[error(transparent)]
     Splat(#[from] freerange_gaussians::SplatError),
-    /// The rasteriser.
+    /// The rasterizer.
     #[error(transparent)]
     Raster(#[from] freerange_raster::RasterError),
     /// The loss.

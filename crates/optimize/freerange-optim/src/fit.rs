@@ -8,7 +8,7 @@ use crate::{
     objective::{Objective, check_cloud, normalize_rotations},
     views::Targets,
 };
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_util::Invalid;
 use rand::{SeedableRng, seq::SliceRandom};
 use rand_chacha::ChaCha8Rng;
@@ -22,13 +22,13 @@ use std::ops::ControlFlow;
 ///
 /// # Errors
 /// If there are no views, or they differ in size from their camera; if the configuration is impossible,
-/// `initial` is empty, not finite or larger than `cap_max`; or if the optimisation diverges.
+/// `initial` is empty, not finite or larger than `cap_max`; or if the optimization diverges.
 pub fn fit<'a>(
     seen: impl Into<Evidence<'a>>,
-    initial: Option<&Cloud>,
+    initial: Option<&Gaussians>,
     config: &FitConfig,
     progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
-) -> Result<Cloud, FitError> {
+) -> Result<Gaussians, FitError> {
     config.check()?;
     let targets = Targets::new(seen, config.render_size)?;
     let mut rng = ChaCha8Rng::seed_from_u64(config.seed);
@@ -36,18 +36,18 @@ pub fn fit<'a>(
         Some(cloud) => checked(cloud, config.cap_max)?,
         None => random_cloud(&targets, config, &mut rng),
     };
-    optimise(cloud, |_| &targets, config, &mut rng, |_, _| Ok(Vec::new()), progress)
+    optimize(cloud, |_| &targets, config, &mut rng, |_, _| Ok(Vec::new()), progress)
 }
 
-/// The optimisation itself. `of_step` is what each step compares with, at whatever size; `more` are further terms of the objective of a cloud over a background.
-pub(crate) fn optimise<'t>(
-    mut cloud: Cloud,
+/// The optimization itself. `of_step` is what each step compares with, at whatever size; `more` are further terms of the objective of a cloud over a background.
+pub(crate) fn optimize<'t>(
+    mut cloud: Gaussians,
     of_step: impl Fn(usize) -> &'t Targets,
     config: &FitConfig,
     rng: &mut ChaCha8Rng,
-    mut more: impl FnMut(&Cloud, [f32; 3]) -> Result<Vec<Objective>, FitError> + Send,
+    mut more: impl FnMut(&Gaussians, [f32; 3]) -> Result<Vec<Objective>, FitError> + Send,
     mut progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
-) -> Result<Cloud, FitError> {
+) -> Result<Gaussians, FitError> {
     let mut adam = Adam::default();
     let (mut queue, mut outline_queue) = (Vec::new(), Vec::new());
     for step in 0..config.iterations {
@@ -98,9 +98,9 @@ pub(crate) fn optimise<'t>(
 }
 
 /// A cloud to start from.
-pub(crate) fn checked(cloud: &Cloud, most: usize) -> Result<Cloud, FitError> {
+pub(crate) fn checked(cloud: &Gaussians, most: usize) -> Result<Gaussians, FitError> {
     if cloud.is_empty() {
-        return Err(FitError::EmptyCloud);
+        return Err(FitError::NoGaussians);
     }
     cloud.check_finite()?;
     if cloud.len() > most {

@@ -1,6 +1,6 @@
 //! Where the object is, as a quick fit tells it: better than masks alone, above all where no view is from behind.
 
-use freerange_gaussians::{Cloud, channel};
+use freerange_gaussians::{Gaussians, channel};
 use freerange_raster::{CHANNELS, render, render_backward};
 use freerange_scene::camera::{CANONICAL_RADIUS, Similarity, View, outline_radius};
 use glam::{DQuat, DVec3};
@@ -9,7 +9,7 @@ use crate::{FitError, views::Targets};
 
 /// Longest side, in pixels, of the renders that tell which Gaussians are seen.
 const SIZE: u32 = 128;
-/// Part of all that is seen that may lie beyond each face of the box. Of 0.25 to 2 %, the best for centres on generated
+/// Part of all that is seen that may lie beyond each face of the box. Of 0.25 to 2 %, the best for centers on generated
 /// objects: less believes strays, more cuts handles off.
 const BEYOND: f64 = 0.005;
 /// The object's radius by that of its outlines: few views seldom have its farthest point on one. Of 1, 1.01 and 1.02
@@ -19,35 +19,35 @@ const HIDDEN: f64 = 1.01;
 const MOST: f64 = 2.0;
 
 /// The correction from a roughly canonical frame, in which both `cloud` and `views` lie, to one as training objects have
-/// it: the box along the axes centred, the farthest point at 0.5. Turns nothing.
+/// it: the box along the axes centerd, the farthest point at 0.5. Turns nothing.
 ///
-/// The centre is that of the box around what the views see of the cloud, each Gaussian counting by its blending
+/// The center is that of the box around what the views see of the cloud, each Gaussian counting by its blending
 /// weights: where nothing is seen, a fit leaves Gaussians anywhere in the visual hull. The size is that of the masks'
-/// outlines about this centre: that of a box of Gaussians depends on how much of them is cut off. The identity where
+/// outlines about this center: that of a box of Gaussians depends on how much of them is cut off. The identity where
 /// there are fewer than two masks, or the cloud is empty, not finite, not seen, or nowhere near.
 ///
 /// # Errors
 /// For views that a fit would refuse.
-pub fn frame_of(cloud: &Cloud, views: &[View]) -> Result<Similarity, FitError> {
+pub fn frame_of(cloud: &Gaussians, views: &[View]) -> Result<Similarity, FitError> {
     let targets = Targets::new(views, Some(SIZE))?;
     if cloud.check_finite().is_err() {
         return Ok(Similarity::IDENTITY);
     }
     let seen = seen(cloud, &targets)?;
-    let correction = box_centre(cloud, &seen).and_then(|centre| {
+    let correction = box_center(cloud, &seen).and_then(|center| {
         // The rough frame's sphere holds the object: no other needs to exceed it by more than the way between them. A
         // speck in one mask may say so.
-        let outlined = outline_radius(views, centre)?.min(CANONICAL_RADIUS + centre.length());
+        let outlined = outline_radius(views, center)?.min(CANONICAL_RADIUS + center.length());
         let scale = CANONICAL_RADIUS / (HIDDEN * outlined);
-        let near = centre.length() < CANONICAL_RADIUS && (1.0 / MOST..=MOST).contains(&scale);
-        near.then_some(Similarity { scale, rotation: DQuat::IDENTITY, translation: -scale * centre })
+        let near = center.length() < CANONICAL_RADIUS && (1.0 / MOST..=MOST).contains(&scale);
+        near.then_some(Similarity { scale, rotation: DQuat::IDENTITY, translation: -scale * center })
     });
     Ok(correction.unwrap_or(Similarity::IDENTITY))
 }
 
-/// The sum of each Gaussian's blending weights over the pixels of all views: the derivative of the sum of one colour's
-/// pixels by that colour of the Gaussian. `[n]`
-fn seen(cloud: &Cloud, targets: &Targets) -> Result<Vec<f64>, FitError> {
+/// The sum of each Gaussian's blending weights over the pixels of all views: the derivative of the sum of one color's
+/// pixels by that color of the Gaussian. `[n]`
+fn seen(cloud: &Gaussians, targets: &Targets) -> Result<Vec<f64>, FitError> {
     let all: Vec<usize> = (0..targets.cameras.len()).collect();
     let mut seen = vec![0.0; cloud.len()];
     for (group, raster) in targets.groups(&all) {
@@ -61,9 +61,9 @@ fn seen(cloud: &Cloud, targets: &Targets) -> Result<Vec<f64>, FitError> {
     Ok(seen)
 }
 
-/// The centre of the box along the axes around the Gaussians up to one standard deviation, weighted. None where nothing
+/// The center of the box along the axes around the Gaussians up to one standard deviation, weighted. None where nothing
 /// weighs.
-fn box_centre(cloud: &Cloud, weights: &[f64]) -> Option<DVec3> {
+fn box_center(cloud: &Gaussians, weights: &[f64]) -> Option<DVec3> {
     let beyond = BEYOND * weights.iter().sum::<f64>();
     if beyond.is_nan() || beyond <= 0.0 {
         return None;
@@ -96,14 +96,14 @@ mod tests {
     use crate::tests::ring;
 
     /// Small opaque Gaussians on the surface of an ellipsoid.
-    fn ellipsoid(centre: DVec3, half: DVec3) -> Cloud {
+    fn ellipsoid(center: DVec3, half: DVec3) -> Gaussians {
         let count = 2000;
-        let mut cloud = Cloud::default();
+        let mut cloud = Gaussians::default();
         for i in 0..count {
             let z = 1.0 - (2.0 * f64::from(i) + 1.0) / f64::from(count);
             let (angle, r) = (2.399_963 * f64::from(i), (1.0 - z * z).sqrt());
             let mut row = [0.0; channel::COUNT];
-            let mean = centre + half * DVec3::new(r * angle.cos(), r * angle.sin(), z);
+            let mean = center + half * DVec3::new(r * angle.cos(), r * angle.sin(), z);
             row[channel::MEAN].copy_from_slice(&mean.as_vec3().to_array());
             row[channel::LOG_SCALE].fill(-5.0);
             row[channel::ROTATION.start] = 1.0;
@@ -116,14 +116,14 @@ mod tests {
 
     #[test]
     fn a_known_box_is_found_and_stray_gaussians_do_not_matter() {
-        let (centre, half) = (DVec3::new(0.06, -0.04, 0.03), DVec3::new(0.4, 0.25, 0.2));
-        let mut cloud = ellipsoid(centre, half);
+        let (center, half) = (DVec3::new(0.06, -0.04, 0.03), DVec3::new(0.4, 0.25, 0.2));
+        let mut cloud = ellipsoid(center, half);
         let views = ring(8, 128, &cloud);
-        let check = |cloud: &Cloud| {
+        let check = |cloud: &Gaussians| {
             let found = frame_of(cloud, &views).unwrap();
             assert_eq!(found.rotation, DQuat::IDENTITY);
             assert!((found.scale * HIDDEN * 0.4 / 0.5 - 1.0).abs() < 0.04, "{found:?}");
-            assert!(found.apply(centre).length() < 0.015, "{found:?}");
+            assert!(found.apply(center).length() < 0.015, "{found:?}");
         };
         check(&cloud);
         // One far away, and many inside, where nothing sees them.
@@ -156,8 +156,9 @@ mod tests {
     fn what_tells_nothing_changes_nothing() {
         let cloud = ellipsoid(DVec3::ZERO, DVec3::splat(0.4));
         let views = ring(4, 48, &cloud);
-        let same = |cloud: &Cloud, views: &[View]| assert_eq!(frame_of(cloud, views).unwrap(), Similarity::IDENTITY);
-        same(&Cloud::default(), &views);
+        let same =
+            |cloud: &Gaussians, views: &[View]| assert_eq!(frame_of(cloud, views).unwrap(), Similarity::IDENTITY);
+        same(&Gaussians::default(), &views);
         same(&ellipsoid(DVec3::splat(50.0), DVec3::splat(0.4)), &views);
         let mut broken = cloud.clone();
         broken.rows_mut()[3] = f32::NAN;

@@ -1,7 +1,7 @@
 //! What keeps a refinement where no photo looks: pictures of the cloud as it was before.
 
 use crate::{FitError, HoldConfig, objective::Objective};
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_raster::{RasterConfig, render, render_backward};
 use freerange_scene::camera::Camera;
 use glam::DVec3;
@@ -14,7 +14,7 @@ const FILLED: f64 = 0.9;
 const HIGHEST: f64 = 0.9;
 /// Pictures are compared as small ones that stand for images of so many pixels a side.
 const FULL_SIZE: f32 = 512.0;
-/// Differences of colours that are rounding.
+/// Differences of colors that are rounding.
 const EQUAL: f32 = 1e-6;
 
 /// Pictures of one cloud, or the mean of several, from all around it.
@@ -45,7 +45,7 @@ fn around(views: usize, size: u32, radius: f64) -> impl Iterator<Item = Camera> 
 
 impl Hold {
     /// The mean pictures of `clouds`; none where they would have no weight.
-    pub fn new(clouds: &[Cloud], config: &HoldConfig) -> Result<Self, FitError> {
+    pub fn new(clouds: &[Gaussians], config: &HoldConfig) -> Result<Self, FitError> {
         let raster = RasterConfig::default().shrunk(config.size as f32 / FULL_SIZE);
         let pixels = (config.size * config.size) as usize;
         let share = 1.0 / clouds.len() as f32;
@@ -70,7 +70,7 @@ impl Hold {
     }
 
     /// The mean absolute difference between picture `view` and `cloud`, both over `background`, times the weight.
-    pub fn objective(&self, cloud: &Cloud, view: usize, background: [f32; 3]) -> Result<Objective, FitError> {
+    pub fn objective(&self, cloud: &Gaussians, view: usize, background: [f32; 3]) -> Result<Objective, FitError> {
         let Picture { camera, rgb, alpha } = &self.pictures[view];
         let out = render(cloud.rows(), &[*camera], &[background], &self.raster)?;
         let share = (self.weight / out.rgb.len() as f64) as f32;

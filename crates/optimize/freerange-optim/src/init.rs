@@ -1,7 +1,7 @@
 //! Where a fit starts when it is given no cloud: random Gaussians inside what all views see as the object.
 
 use crate::{FitConfig, views::Targets};
-use freerange_gaussians::{Cloud, channel};
+use freerange_gaussians::{Gaussians, channel};
 use glam::DVec3;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -16,7 +16,7 @@ const OPAQUE: u8 = 128;
 
 /// `config.initial` Gaussians at random points of the sphere of radius `config.radius` about the origin, those first
 /// that the fewest views see as transparent (the visual hull, where the masks agree on one).
-pub(crate) fn random_cloud(targets: &Targets, config: &FitConfig, rng: &mut ChaCha8Rng) -> Cloud {
+pub(crate) fn random_cloud(targets: &Targets, config: &FitConfig, rng: &mut ChaCha8Rng) -> Gaussians {
     let count = config.initial;
     let opaque = targets.images.iter().all(|image| image.pixels().all(|p| p[3] >= OPAQUE));
     let tried = if opaque { count } else { (CANDIDATES * count).min(MAX_CANDIDATES).max(count) };
@@ -34,9 +34,9 @@ pub(crate) fn random_cloud(targets: &Targets, config: &FitConfig, rng: &mut ChaC
 
     let points: Vec<DVec3> = seen.iter().map(|(.., point)| *point).collect();
     let logit = (config.initial_opacity / (1.0 - config.initial_opacity)).ln() as f32;
-    let mut cloud = Cloud::default();
-    for ((_, color, point), distance) in seen.iter().zip(neighbour_distances(&points)) {
-        // One point alone has no neighbours: it stands for all of the sphere.
+    let mut cloud = Gaussians::default();
+    for ((_, color, point), distance) in seen.iter().zip(neighbor_distances(&points)) {
+        // One point alone has no neighbors: it stands for all of the sphere.
         let size = if distance.is_finite() { distance.max(1e-6 * config.radius) } else { config.radius };
         let mut row = [0.0; channel::COUNT];
         row[channel::MEAN].copy_from_slice(&point.as_vec3().to_array());
@@ -58,7 +58,7 @@ fn in_unit_ball(rng: &mut ChaCha8Rng) -> DVec3 {
     }
 }
 
-/// How many views see `point` as transparent, and the mean colour of the others; grey where there is none.
+/// How many views see `point` as transparent, and the mean color of the others; gray where there is none.
 fn judge(targets: &Targets, point: DVec3) -> (usize, [f32; 3]) {
     let (mut outside, mut inside, mut sum) = (0, 0u32, [0u32; 3]);
     for (i, pixel) in (0..targets.cameras.len()).filter_map(|i| Some((i, targets.pixel(i, point)?))) {
@@ -75,7 +75,7 @@ fn judge(targets: &Targets, point: DVec3) -> (usize, [f32; 3]) {
 
 /// The root mean square distance of each point to its three nearest others (fewer where there are fewer); infinite for
 /// a point alone. Points are walked through in the order of their x, from each one outwards until x alone is too far.
-fn neighbour_distances(points: &[DVec3]) -> Vec<f64> {
+fn neighbor_distances(points: &[DVec3]) -> Vec<f64> {
     let mut order: Vec<usize> = (0..points.len()).collect();
     order.sort_by(|&a, &b| points[a].x.total_cmp(&points[b].x));
     let sorted: Vec<DVec3> = order.iter().map(|&i| points[i]).collect();
@@ -113,11 +113,11 @@ mod tests {
     use rand_chacha::rand_core::SeedableRng;
 
     #[test]
-    fn neighbours_match_brute_force() {
+    fn neighbors_match_brute_force() {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
         for n in [1, 2, 3, 4, 300] {
             let points: Vec<DVec3> = (0..n).map(|_| in_unit_ball(&mut rng)).collect();
-            for (i, found) in neighbour_distances(&points).into_iter().enumerate() {
+            for (i, found) in neighbor_distances(&points).into_iter().enumerate() {
                 let mut all: Vec<f64> =
                     (0..n).filter(|&j| j != i).map(|j| points[i].distance_squared(points[j])).collect();
                 all.sort_by(f64::total_cmp);

@@ -42,7 +42,7 @@ pub use quick::{QuickFitConfig, quick_fit, tree_slice};
 pub use refine::refine;
 pub use views::{Evidence, Outline};
 
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 
 /// How far [`fit`] or [`refine`] has come.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -56,5 +56,5 @@ pub struct FitProgress<'a> {
     /// Number of Gaussians.
     pub gaussians: usize,
     /// The Gaussians by now, in the frame of the views.
-    pub cloud: &'a Cloud,
+    pub cloud: &'a Gaussians,
 }

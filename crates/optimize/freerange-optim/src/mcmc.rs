@@ -2,7 +2,7 @@
 //! image little, the number of Gaussians grows in the same way, and noise moves the faint ones about.
 
 use crate::{FitConfig, adam::Adam};
-use freerange_gaussians::{Cloud, channel};
+use freerange_gaussians::{Gaussians, channel};
 use glam::DVec3;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -14,7 +14,7 @@ const OPACITY: std::ops::RangeInclusive<f64> = 0.005..=1.0 - f32::EPSILON as f64
 const MAX_COPIES: usize = 51;
 
 /// How to replace one Gaussian of opacity `opacity` by `copies` equal ones in the same place: their opacity, and the
-/// factor on their standard deviations that keeps the integral of the alpha along a line through the centre (eq. 9).
+/// factor on their standard deviations that keeps the integral of the alpha along a line through the center (eq. 9).
 /// The opacity is brought into its range only after the factor is computed, as the paper's authors do.
 pub(crate) fn relocation(opacity: f64, copies: usize) -> (f64, f64) {
     // At an opacity of 1 the copies' would be 1 as well, and the sum below has terms up to 1e14.
@@ -32,7 +32,7 @@ pub(crate) fn relocation(opacity: f64, copies: usize) -> (f64, f64) {
 }
 
 /// Makes Gaussian `i` one of `copies` that look together as it does.
-pub(crate) fn split(cloud: &mut Cloud, i: usize, copies: usize) {
+pub(crate) fn split(cloud: &mut Gaussians, i: usize, copies: usize) {
     let (opacity, factor) = relocation(cloud.opacity(i), copies.min(MAX_COPIES));
     let row = &mut cloud.as_mut_rows()[i];
     row[channel::LOGIT_OPACITY] = (opacity / (1.0 - opacity)).ln() as f32;
@@ -47,7 +47,7 @@ pub(crate) fn grown(count: usize, config: &FitConfig) -> usize {
 }
 
 /// Moves dead Gaussians to live ones, then adds new ones, both drawn in proportion to opacity.
-pub(crate) fn relocate_and_grow(cloud: &mut Cloud, adam: &mut Adam, config: &FitConfig, rng: &mut ChaCha8Rng) {
+pub(crate) fn relocate_and_grow(cloud: &mut Gaussians, adam: &mut Adam, config: &FitConfig, rng: &mut ChaCha8Rng) {
     let opacities: Vec<f64> = (0..cloud.len()).map(|i| cloud.opacity(i)).collect();
     let alive: Vec<f64> = opacities.iter().map(|&o| if o > config.dead_opacity { o } else { 0.0 }).collect();
     let dead: Vec<usize> = (0..cloud.len()).filter(|&i| alive[i] == 0.0).collect();
@@ -64,7 +64,7 @@ pub(crate) fn relocate_and_grow(cloud: &mut Cloud, adam: &mut Adam, config: &Fit
 }
 
 /// Puts the Gaussians `targets` where others are, drawn by `weights`; these and the targets share the opacity.
-fn place(cloud: &mut Cloud, adam: &mut Adam, weights: &[f64], targets: &[usize], rng: &mut ChaCha8Rng) {
+fn place(cloud: &mut Gaussians, adam: &mut Adam, weights: &[f64], targets: &[usize], rng: &mut ChaCha8Rng) {
     let Ok(draw) = WeightedIndex::new(weights) else { return }; // not numbers: the caller's check says so
     let mut copies = vec![1; weights.len()];
     let sources: Vec<usize> = targets.iter().map(|_| draw.sample(rng)).collect();
@@ -83,9 +83,9 @@ fn place(cloud: &mut Cloud, adam: &mut Adam, weights: &[f64], targets: &[usize],
 /// Variances times less than this move nothing that f32 could tell.
 const STILL: f64 = 1e-9;
 
-/// Moves each centre by `Sigma xi sigmoid(-100 (o - dead)) strength`, with `xi` standard normal: along the Gaussian's own
-/// shape, and only where it is faint. `strength` is the noise of the configuration times the centres' learning rate.
-pub(crate) fn add_noise(cloud: &mut Cloud, strength: f64, dead_opacity: f64, rng: &mut ChaCha8Rng) {
+/// Moves each center by `Sigma xi sigmoid(-100 (o - dead)) strength`, with `xi` standard normal: along the Gaussian's own
+/// shape, and only where it is faint. `strength` is the noise of the configuration times the centers' learning rate.
+pub(crate) fn add_noise(cloud: &mut Gaussians, strength: f64, dead_opacity: f64, rng: &mut ChaCha8Rng) {
     // Gaussians from this opacity on stay where they are, the most: nothing is drawn for them.
     let still = dead_opacity + 0.01 * (strength / STILL).ln(); // -inf without noise
     if still <= 0.0 {
@@ -102,7 +102,7 @@ pub(crate) fn add_noise(cloud: &mut Cloud, strength: f64, dead_opacity: f64, rng
     }
 }
 
-fn noise(cloud: &Cloud, i: usize, xi: DVec3, strength: f64, dead_opacity: f64) -> DVec3 {
+fn noise(cloud: &Gaussians, i: usize, xi: DVec3, strength: f64, dead_opacity: f64) -> DVec3 {
     let gate = 1.0 / (1.0 + (100.0 * (cloud.opacity(i) - dead_opacity)).exp());
     cloud.covariance(i) * (xi * (gate * strength))
 }
@@ -112,7 +112,7 @@ trait Rows {
     fn as_mut_rows(&mut self) -> &mut [[f32; channel::COUNT]];
 }
 
-impl Rows for Cloud {
+impl Rows for Gaussians {
     fn as_mut_rows(&mut self) -> &mut [[f32; channel::COUNT]] {
         self.rows_mut().as_chunks_mut().0
     }
@@ -173,7 +173,7 @@ mod tests {
             row[channel::ROTATION].copy_from_slice(&quats[4 * i..][..4]);
             row[channel::LOGIT_OPACITY] = logits[i];
             let xi = DVec3::from_array(std::array::from_fn(|k| f64::from(xi[3 * i + k])));
-            let found = noise(&Cloud::from_rows(row.to_vec()), 0, xi, f64::from(1.6e-4f32) * 5e5, 0.005);
+            let found = noise(&Gaussians::from_rows(row.to_vec()), 0, xi, f64::from(1.6e-4f32) * 5e5, 0.005);
             for k in 0..3 {
                 let truth = expected[3 * i + k];
                 let tolerance = 2e-3 * f64::from(truth.abs()) + 1e-9 * f64::from(largest);
@@ -215,8 +215,8 @@ mod tests {
         assert_eq!(grown(990, &config), 1000);
     }
 
-    fn example(logits: &[f32]) -> Cloud {
-        let mut cloud = Cloud::default();
+    fn example(logits: &[f32]) -> Gaussians {
+        let mut cloud = Gaussians::default();
         for (i, &logit) in logits.iter().enumerate() {
             let x = i as f32;
             cloud.push(&[x, -x, 1.0, -3.0, -2.0, -4.0, 1.0, 0.0, 0.0, 0.0, logit, 0.1 * x, 0.5, 0.5]);

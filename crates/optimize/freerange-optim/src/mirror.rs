@@ -2,7 +2,7 @@
 
 use std::ops::ControlFlow;
 
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_scene::camera::{Camera, View};
 use freerange_util::side_by_side;
 use glam::{DMat3, DMat4, DVec3};
@@ -113,7 +113,7 @@ pub fn mirror_steps(config: &QuickFitConfig) -> usize {
 /// Those of [`fit`](crate::fit()).
 pub fn find_mirror(
     views: &[View],
-    own: &Cloud,
+    own: &Gaussians,
     config: &QuickFitConfig,
     most: f64,
     seed: u64,
@@ -124,7 +124,7 @@ pub fn find_mirror(
     let planes = planes(&Hull::new(&outlines), &outlines);
     let pictures = Targets::new(views, Some(PICTURE))?;
     let mut search = Search { progress: &mut progress, seed, done: 0 };
-    let put = |cloud: &Cloud, plane: Mirror, reach| {
+    let put = |cloud: &Gaussians, plane: Mirror, reach| {
         place(plane, [reach, 0.001], |plane| difference(cloud, &pictures, Some(plane), true))
     };
     let judge = |plane: Mirror| Ok((difference(own, &pictures, Some(&plane), true)?, plane));
@@ -226,7 +226,7 @@ mod tests {
     use freerange_gaussians::channel;
 
     /// Round Gaussians, so that turning them is no matter.
-    fn round(n: usize, seed: u64) -> Cloud {
+    fn round(n: usize, seed: u64) -> Gaussians {
         let mut cloud = ball(n, seed);
         for row in cloud.iter_mut() {
             row[channel::LOG_SCALE].fill(-2.4);
@@ -235,7 +235,7 @@ mod tests {
         cloud
     }
 
-    fn behind(cloud: &Cloud, mirror: &Mirror) -> Cloud {
+    fn behind(cloud: &Gaussians, mirror: &Mirror) -> Gaussians {
         let mut cloud = cloud.clone();
         for row in cloud.iter_mut() {
             let mean = DVec3::from_array([0, 1, 2].map(|i| f64::from(row[channel::MEAN.start + i])));
@@ -245,13 +245,13 @@ mod tests {
     }
 
     /// Its own mirror image.
-    fn twins(n: usize, seed: u64, mirror: &Mirror) -> Cloud {
+    fn twins(n: usize, seed: u64, mirror: &Mirror) -> Gaussians {
         let half = round(n, seed);
         let both = half.iter().chain(behind(&half, mirror).iter()).copied().collect::<Vec<_>>();
-        Cloud::from_rows(both.into_iter().flatten().collect())
+        Gaussians::from_rows(both.into_iter().flatten().collect())
     }
 
-    fn photos(cloud: &Cloud) -> Vec<View> {
+    fn photos(cloud: &Gaussians) -> Vec<View> {
         cameras(4, 64, 0.3).iter().map(|c| photograph(cloud, c)).collect()
     }
 
@@ -279,7 +279,7 @@ mod tests {
     #[test]
     fn what_is_its_own_mirror_image_is_told_from_what_is_not() {
         let config = QuickFitConfig { iterations: 120, gaussians: 150, render_size: 64 };
-        let find = |cloud: &Cloud| {
+        let find = |cloud: &Gaussians| {
             find_mirror(&photos(cloud), &own(&photos(cloud), &config), &config, f64::INFINITY, 0, |_| {
                 ControlFlow::Continue(())
             })

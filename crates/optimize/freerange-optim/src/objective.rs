@@ -1,7 +1,7 @@
 //! The loss of a cloud against views, and its gradient.
 
 use crate::{FitError, views::Targets};
-use freerange_gaussians::{Cloud, channel};
+use freerange_gaussians::{Gaussians, channel};
 use freerange_raster::metrics::photometric_loss;
 use freerange_raster::{render, render_backward};
 use rayon::prelude::*;
@@ -15,7 +15,7 @@ pub(crate) struct Objective {
 impl Objective {
     /// Mean over the `chosen` views of `(1 - lambda) L1 + lambda (1 - SSIM)`, all over one `background`.
     pub fn photometric(
-        cloud: &Cloud,
+        cloud: &Gaussians,
         targets: &Targets,
         chosen: &[usize],
         background: [f32; 3],
@@ -48,7 +48,7 @@ impl Objective {
     }
 
     /// Mean over the `chosen` outlines, counted from the first of them, of the absolute difference of alpha.
-    pub fn outlines(cloud: &Cloud, targets: &Targets, chosen: &[usize]) -> Result<Self, FitError> {
+    pub fn outlines(cloud: &Gaussians, targets: &Targets, chosen: &[usize]) -> Result<Self, FitError> {
         let mut sum = Self { loss: 0.0, gradients: vec![0.0; cloud.rows().len()] };
         let chosen: Vec<usize> = chosen.iter().map(|&i| targets.views + i).collect();
         for (group, raster) in targets.groups(&chosen) {
@@ -77,7 +77,7 @@ impl Objective {
     }
 
     /// Adds `weight` times the mean opacity.
-    pub fn add_opacity(&mut self, cloud: &Cloud, weight: f64) {
+    pub fn add_opacity(&mut self, cloud: &Gaussians, weight: f64) {
         if weight == 0.0 {
             return;
         }
@@ -90,7 +90,7 @@ impl Objective {
     }
 
     /// Adds `weight` times the mean standard deviation.
-    pub fn add_scale(&mut self, cloud: &Cloud, weight: f64) {
+    pub fn add_scale(&mut self, cloud: &Gaussians, weight: f64) {
         if weight == 0.0 {
             return;
         }
@@ -166,7 +166,7 @@ const TASK: usize = 1024 * channel::COUNT;
 
 /// Calls `f(row, gradient)` for every Gaussian, and sums what it returns, always in the same order.
 fn each_row(
-    cloud: &Cloud,
+    cloud: &Gaussians,
     gradients: &mut [f32],
     f: impl Fn(&[f32; channel::COUNT], &mut [f32; channel::COUNT]) -> f32 + Sync,
 ) -> f64 {
@@ -185,12 +185,12 @@ fn finite(values: &[f32]) -> bool {
 }
 
 /// Refuses to go on with a cloud that is not finite.
-pub(crate) fn check_cloud(cloud: &Cloud, step: usize) -> Result<(), FitError> {
+pub(crate) fn check_cloud(cloud: &Gaussians, step: usize) -> Result<(), FitError> {
     if finite(cloud.rows()) { Ok(()) } else { Err(FitError::Diverged { step, what: "a Gaussian" }) }
 }
 
 /// Gives every quaternion unit length, so that its learning rate means an angle.
-pub(crate) fn normalize_rotations(cloud: &mut Cloud) {
+pub(crate) fn normalize_rotations(cloud: &mut Gaussians) {
     cloud.rows_mut().par_chunks_mut(TASK).for_each(|rows| {
         for row in rows.as_chunks_mut::<{ channel::COUNT }>().0 {
             let q = &mut row[channel::ROTATION];
@@ -258,7 +258,7 @@ mod tests {
         assert_eq!(targets.groups(&[0, 1, 2]).map(|(group, _)| group.len()).collect::<Vec<_>>(), [2, 1]);
         let hold = HoldConfig { weight: 0.5, views: 5, size: 24, ..Default::default() };
         let hold = Hold::new(&[ball(12, 2)], &hold).unwrap();
-        let value = |cloud: &Cloud| {
+        let value = |cloud: &Gaussians| {
             let mut o = Objective::photometric(cloud, &targets, &[0, 2], [0.3, 0.6, 0.1], 0.2).unwrap();
             o.add_opacity(cloud, 0.3);
             o.add_scale(cloud, 0.7);
@@ -277,20 +277,20 @@ mod tests {
             Some(32),
         )
         .unwrap();
-        let outlines = |cloud: &Cloud, chosen: &[usize]| Objective::outlines(cloud, &targets, chosen).unwrap();
+        let outlines = |cloud: &Gaussians, chosen: &[usize]| Objective::outlines(cloud, &targets, chosen).unwrap();
         check_gradient(|cloud| outlines(cloud, &[0, 2]));
-        // Colours are no part of them.
-        let mut grey = ball(12, 3);
-        let colored = outlines(&grey, &[1]);
-        grey.iter_mut().for_each(|row| row[channel::COLOR].fill(0.5));
-        let found = outlines(&grey, &[1]);
+        // Colors are no part of them.
+        let mut gray = ball(12, 3);
+        let colored = outlines(&gray, &[1]);
+        gray.iter_mut().for_each(|row| row[channel::COLOR].fill(0.5));
+        let found = outlines(&gray, &[1]);
         assert_eq!((found.loss, found.gradients), (colored.loss, colored.gradients));
         // What agrees has nothing to learn but what rounding to bytes leaves.
         let own = outlines(&ball(12, 1), &[0, 1]);
         assert!(own.loss < 2e-3 && colored.loss > 10.0 * own.loss, "{} {}", own.loss, colored.loss);
     }
 
-    fn check_gradient(value: impl Fn(&Cloud) -> Objective) {
+    fn check_gradient(value: impl Fn(&Gaussians) -> Objective) {
         let mut cloud = ball(12, 3);
         let gradients = value(&cloud).gradients;
         let largest = gradients.iter().fold(0.0f32, |m, g| m.max(g.abs()));
@@ -307,7 +307,7 @@ mod tests {
             let difference = ((above - below) / f64::from(2.0 * h)) as f32;
             off += usize::from((difference - gradients[i]).abs() > 0.03 * largest);
         }
-        // L1 and the rasteriser's cut-offs have kinks; few differences straddle one.
+        // L1 and the rasterizer's cut-offs have kinks; few differences straddle one.
         assert!(off * 20 < cloud.rows().len(), "{off} of {} gradients are off", cloud.rows().len());
     }
 }

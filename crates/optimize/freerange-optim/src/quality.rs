@@ -1,6 +1,6 @@
 //! How well Gaussians show an object.
 
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_raster::RasterConfig;
 use freerange_raster::metrics::capped_psnr;
 use freerange_scene::camera::{Camera, View};
@@ -11,8 +11,8 @@ use crate::FitError;
 /// PSNR in dB of renders of `cloud` against `views`, in front of white: mean over the views.
 ///
 /// # Errors
-/// [`FitError::NoViews`]; what the rasteriser refuses.
-pub fn psnr_over_white(cloud: &Cloud, views: &[View]) -> Result<f64, FitError> {
+/// [`FitError::NoViews`]; what the rasterizer refuses.
+pub fn psnr_over_white(cloud: &Gaussians, views: &[View]) -> Result<f64, FitError> {
     if views.is_empty() {
         return Err(FitError::NoViews);
     }
@@ -26,8 +26,8 @@ pub fn psnr_over_white(cloud: &Cloud, views: &[View]) -> Result<f64, FitError> {
 /// `cloud` in front of white, clamped to 0..1, sRGB-encoded. `[h, w, 3]`
 ///
 /// # Errors
-/// What the rasteriser refuses.
-pub fn render_over_white(cloud: &Cloud, camera: &Camera) -> Result<Vec<f32>, FitError> {
+/// What the rasterizer refuses.
+pub fn render_over_white(cloud: &Gaussians, camera: &Camera) -> Result<Vec<f32>, FitError> {
     let image = freerange_raster::render(cloud.rows(), &[*camera], &[[1.0; 3]], &RasterConfig::default())?;
     Ok(image.rgb.into_iter().map(|v| v.clamp(0.0, 1.0)).collect())
 }
@@ -47,7 +47,7 @@ mod tests {
 
     #[test]
     fn no_views_have_no_mean() {
-        assert!(matches!(psnr_over_white(&Cloud::default(), &[]), Err(FitError::NoViews)));
+        assert!(matches!(psnr_over_white(&Gaussians::default(), &[]), Err(FitError::NoViews)));
     }
 
     #[test]

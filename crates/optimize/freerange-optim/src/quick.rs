@@ -2,7 +2,7 @@
 
 use std::ops::ControlFlow;
 
-use freerange_gaussians::{Alignment, Cloud, LodTree};
+use freerange_gaussians::{Alignment, Gaussians, LodTree};
 use serde::{Deserialize, Serialize};
 
 use crate::{Evidence, FitConfig, FitError, FitProgress, config::check, fit};
@@ -58,7 +58,7 @@ pub fn quick_fit<'a>(
     config: &QuickFitConfig,
     seed: u64,
     progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
-) -> Result<Cloud, FitError> {
+) -> Result<Gaussians, FitError> {
     config.check()?;
     fit(seen, None, &config.config(seed), progress)
 }
@@ -69,22 +69,22 @@ pub fn quick_fit<'a>(
 /// # Errors
 /// Those of [`fit`].
 pub(crate) fn polish<'a>(
-    cloud: &Cloud,
+    cloud: &Gaussians,
     seen: impl Into<Evidence<'a>>,
     config: &QuickFitConfig,
     seed: u64,
     progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
-) -> Result<Cloud, FitError> {
+) -> Result<Gaussians, FitError> {
     config.check()?;
     let own = QuickFitConfig { gaussians: cloud.len(), ..config.clone() };
     fit(seen, Some(cloud), &own.config(seed), progress)
 }
 
-/// `cloud` as `2^depth` Gaussians in the order of its level-of-detail tree, axes labelled by the world's: as the network
+/// `cloud` as `2^depth` Gaussians in the order of its level-of-detail tree, axes labeled by the world's: as the network
 /// takes and makes them.
 ///
 /// # Errors
 /// For a cloud that is empty or not finite.
-pub fn tree_slice(cloud: &Cloud, depth: u32) -> Result<Cloud, FitError> {
+pub fn tree_slice(cloud: &Gaussians, depth: u32) -> Result<Gaussians, FitError> {
     Ok(LodTree::build_to_depth(cloud, depth, Alignment::Identity)?.slice(depth)?)
 }

@@ -2,13 +2,13 @@
 
 use crate::{
     Evidence, FitError, FitProgress, RefineConfig,
-    fit::{checked, next_views, optimise},
+    fit::{checked, next_views, optimize},
     hold::Hold,
     mcmc::split,
     objective::Objective,
     views::Targets,
 };
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use std::ops::ControlFlow;
@@ -27,14 +27,14 @@ const OUTLINES: u32 = 128;
 ///
 /// # Errors
 /// If there are no views, or they differ in size from their camera; if the configuration is impossible;
-/// if the cloud is empty or not finite; or if the optimisation diverges.
+/// if the cloud is empty or not finite; or if the optimization diverges.
 pub fn refine<'a>(
-    cloud: &Cloud,
-    others: &[Cloud],
+    cloud: &Gaussians,
+    others: &[Gaussians],
     seen: impl Into<Evidence<'a>>,
     config: &RefineConfig,
     progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
-) -> Result<Cloud, FitError> {
+) -> Result<Gaussians, FitError> {
     config.check()?;
     let seen = seen.into();
     let targets = Targets::new(seen.views, config.render_size)?;
@@ -56,7 +56,7 @@ pub fn refine<'a>(
     let mut queue = Vec::new();
     // Photos have more to tell here than shape: outlines come beside them, at every other step.
     let (mut outline_queue, mut step) = (Vec::new(), 0);
-    let more = |cloud: &Cloud, background| {
+    let more = |cloud: &Gaussians, background| {
         step += 1;
         let outlined = outlines.as_ref().filter(|_| step % 2 == 0);
         let outlined = outlined.map(|targets| (targets, next_views(&mut outline_queue, further, 1, &mut hold_rng)));
@@ -68,12 +68,12 @@ pub fn refine<'a>(
         Ok(outlined?.into_iter().chain(held?).collect())
     };
     let of_step = |step| coarse.as_ref().filter(|_| step < first).unwrap_or(&targets);
-    optimise(start, of_step, &fit, &mut rng, more, progress)
+    optimize(start, of_step, &fit, &mut rng, more, progress)
 }
 
 /// As many of `clouds` as `most` Gaussians allow, but the first in any case, in one place. Each Gaussian becomes what relocation
 /// makes of one of so many copies: were the clouds equal, they would look as one.
-fn together(clouds: &[Cloud], most: usize) -> Cloud {
+fn together(clouds: &[Gaussians], most: usize) -> Gaussians {
     let mut total = 0;
     let fitting = clouds.iter().take_while(|cloud| {
         total += cloud.len();
@@ -83,7 +83,7 @@ fn together(clouds: &[Cloud], most: usize) -> Cloud {
     if copies < 2 {
         return clouds[0].clone();
     }
-    let mut all = Cloud::from_rows(clouds[..copies].iter().flat_map(Cloud::rows).copied().collect());
+    let mut all = Gaussians::from_rows(clouds[..copies].iter().flat_map(Gaussians::rows).copied().collect());
     (0..all.len()).for_each(|i| split(&mut all, i, copies));
     all
 }

@@ -3,7 +3,7 @@
 
 use std::{f64::consts::PI, ops::ControlFlow};
 
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_raster::render;
 use freerange_scene::camera::Camera;
 use glam::DVec3;
@@ -49,10 +49,10 @@ impl<P: FnMut(usize) -> ControlFlow<()>> Search<'_, P> {
     /// A quick fit, or one that goes on from `start`.
     pub fn fitted<'b>(
         &mut self,
-        start: Option<&Cloud>,
+        start: Option<&Gaussians>,
         seen: impl Into<Evidence<'b>>,
         config: &QuickFitConfig,
-    ) -> Result<Option<Cloud>, FitError> {
+    ) -> Result<Option<Gaussians>, FitError> {
         let mut ended = false;
         let tell = |p: &FitProgress<'_>| {
             let told = (self.progress)(self.done + p.step);
@@ -118,9 +118,9 @@ pub(crate) fn place<S: Symmetry>(
 }
 
 /// Mean absolute difference between a cloud and views of it, from their own cameras or from those that a symmetry makes of them: of alpha,
-/// plus, where `colors` count, that of colour times alpha.
+/// plus, where `colors` count, that of color times alpha.
 pub(crate) fn difference<S: Symmetry>(
-    cloud: &Cloud,
+    cloud: &Gaussians,
     targets: &Targets,
     symmetry: Option<&S>,
     colors: bool,

@@ -1,8 +1,8 @@
-//! Fits of small scenes that the rasteriser itself has drawn, and what all tests share.
+//! Fits of small scenes that the rasterizer itself has drawn, and what all tests share.
 
 use crate::*;
 use crate::{quick::polish, views::Targets};
-use freerange_gaussians::{Cloud, channel};
+use freerange_gaussians::{Gaussians, channel};
 use freerange_raster::{RasterConfig, render};
 use freerange_scene::camera::{Camera, View};
 use glam::DVec3;
@@ -10,10 +10,10 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::ops::ControlFlow;
 
-/// `n` opaque, coloured Gaussians in a ball of radius 0.4.
-pub(crate) fn ball(n: usize, seed: u64) -> Cloud {
+/// `n` opaque, colored Gaussians in a ball of radius 0.4.
+pub(crate) fn ball(n: usize, seed: u64) -> Gaussians {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let mut cloud = Cloud::default();
+    let mut cloud = Gaussians::default();
     while cloud.len() < n {
         let mean = DVec3::from_array(std::array::from_fn(|_| rng.random_range(-0.4..0.4)));
         if mean.length() > 0.4 {
@@ -44,7 +44,7 @@ pub(crate) fn cameras(count: usize, size: u32, turn: f64) -> Vec<Camera> {
 }
 
 /// The cloud as seen by a camera, with straight alpha.
-pub(crate) fn photograph(cloud: &Cloud, camera: &Camera) -> View {
+pub(crate) fn photograph(cloud: &Gaussians, camera: &Camera) -> View {
     let out = render(cloud.rows(), &[*camera], &[[0.0; 3]], &RasterConfig::default()).unwrap();
     let mut image = image::RgbaImage::new(camera.width, camera.height);
     for (i, pixel) in image.pixels_mut().enumerate() {
@@ -83,17 +83,17 @@ fn outlines_share_pictures() {
 }
 
 /// What searches for symmetries begin with.
-pub(crate) fn own(views: &[View], config: &QuickFitConfig) -> Cloud {
+pub(crate) fn own(views: &[View], config: &QuickFitConfig) -> Gaussians {
     quick_fit(views, config, 0, go).unwrap()
 }
 
 /// Views of the cloud from all around.
-pub(crate) fn ring(count: usize, size: u32, cloud: &Cloud) -> Vec<View> {
+pub(crate) fn ring(count: usize, size: u32, cloud: &Gaussians) -> Vec<View> {
     cameras(count, size, 0.0).iter().map(|c| photograph(cloud, c)).collect()
 }
 
 /// Mean PSNR in dB of the cloud against views, over white.
-fn psnr(cloud: &Cloud, views: &[View]) -> f64 {
+fn psnr(cloud: &Gaussians, views: &[View]) -> f64 {
     let values = views.iter().map(|v| {
         let out = render(cloud.rows(), &[v.camera], &[[1.0; 3]], &RasterConfig::default()).unwrap();
         let shown: Vec<f32> = out.rgb.iter().map(|v| v.clamp(0.0, 1.0)).collect();
@@ -183,7 +183,7 @@ fn polishing_keeps_the_number_and_comes_nearer() {
     assert_eq!((steps, polished.len()), (150, 30));
     let [before, after] = [&rough, &polished].map(|cloud| psnr(cloud, &views));
     assert!(after > before + 2.0, "{before} dB, polished {after} dB");
-    assert!(polish(&Cloud::default(), &views, &config, 3, go).is_err());
+    assert!(polish(&Gaussians::default(), &views, &config, 3, go).is_err());
 }
 
 /// A cloud as a generator might give it: right on the whole, wrong in detail.
@@ -191,7 +191,7 @@ fn evidence<'a>(views: &'a [View], outlines: &'a [View]) -> Evidence<'a> {
     Evidence { views, outlines: outlines.iter().map(Outline::from).collect() }
 }
 
-/// Outlines from further places mend the shape, and tell no colours.
+/// Outlines from further places mend the shape, and tell no colors.
 #[test]
 fn outlines_are_fitted_to() {
     let scene = ball(40, 12);
@@ -201,7 +201,7 @@ fn outlines_are_fitted_to() {
     let seen = |outlines| evidence(&photos, outlines);
     let alone = fit(&photos, None, &config, go).unwrap();
     let helped = fit(seen(&outlines), None, &config, go).unwrap();
-    let apart = |cloud: &Cloud| {
+    let apart = |cloud: &Gaussians| {
         let views = cameras(5, 32, 1.0).into_iter().map(|c| (photograph(&scene, &c), photograph(cloud, &c)));
         let each = views.map(|(a, b)| {
             let pixels = a.image.pixels().zip(b.image.pixels());
@@ -214,14 +214,14 @@ fn outlines_are_fitted_to() {
     let [plain, outlined] =
         [&[][..], &outlines].map(|outlines| refine(&alone, &[], seen(outlines), &config_of_refinement, go).unwrap());
     assert!(apart(&outlined) < 0.8 * apart(&plain), "{} {}", apart(&outlined), apart(&plain));
-    let mut grey = outlines.clone();
-    grey.iter_mut().for_each(|view| view.image.pixels_mut().for_each(|p| p.0 = [9, 99, 199, p[3]]));
-    let other = fit(seen(&grey), None, &config, go).unwrap();
+    let mut gray = outlines.clone();
+    gray.iter_mut().for_each(|view| view.image.pixels_mut().for_each(|p| p.0 = [9, 99, 199, p[3]]));
+    let other = fit(seen(&gray), None, &config, go).unwrap();
     assert_eq!(other, helped);
     assert!(matches!(fit(evidence(&[], &outlines), None, &config, go), Err(FitError::NoViews)));
 }
 
-fn disturbed(cloud: &Cloud, seed: u64) -> Cloud {
+fn disturbed(cloud: &Gaussians, seed: u64) -> Gaussians {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut out = cloud.clone();
     for row in out.iter_mut() {
@@ -285,7 +285,7 @@ fn clouds_are_refined_together() {
     let scene = ball(60, 21);
     let start = disturbed(&scene, 22);
     let (views, alone) = (ring(4, 64, &scene), ring(4, 64, &start));
-    let begun = |others: &[Cloud], gaussians| {
+    let begun = |others: &[Gaussians], gaussians| {
         let hold = small_hold();
         // Too slow to move anything.
         let rates = Rates { mean: 1e-9, scale: 0.0, rotation: 0.0, opacity: 0.0, color: 0.0 };
@@ -322,7 +322,7 @@ fn clouds_are_refined_together() {
 fn a_hold_keeps_the_unseen_side() {
     let scene = ball(150, 31);
     let start = disturbed(&scene, 32);
-    let from = |angle: f64, cloud: &Cloud| {
+    let from = |angle: f64, cloud: &Gaussians| {
         let turned = [-0.3, 0.0, 0.3].map(|turn| {
             let (sin, cos) = (angle + turn).sin_cos();
             Camera::look_at(1.5 * DVec3::new(cos, sin, turn), DVec3::ZERO, DVec3::Z, 0.857, 64, 64)
@@ -353,8 +353,8 @@ fn other_guesses_help_on_the_unseen_side() {
         turned.map(|c| photograph(&scene, &c))
     };
     let (photos, behind) = (from(0.0), from(std::f64::consts::PI));
-    let guesses: Vec<Cloud> = (32..36).map(|seed| disturbed(&scene, seed)).collect();
-    let refined = |others: &[Cloud]| {
+    let guesses: Vec<Gaussians> = (32..36).map(|seed| disturbed(&scene, seed)).collect();
+    let refined = |others: &[Gaussians]| {
         let hold = HoldConfig { weight: 0.5, ..small_hold() };
         refine(&guesses[0], others, &photos, &RefineConfig { gaussians: 200, hold, ..Default::default() }, go).unwrap()
     };
@@ -390,17 +390,17 @@ fn views_may_have_any_size() {
     }
     let fitted = fit(&photos, None, &FitConfig { views_per_step: 3, render_size: Some(64), ..small() }, go).unwrap();
     assert!(psnr(&fitted, &photos) > 25.0, "{} dB", psnr(&fitted, &photos));
-    let centred = frame_of(&fitted, &photos).unwrap();
-    assert!(centred.translation.length() < 0.1 && (0.8..1.25).contains(&centred.scale), "{centred:?}");
+    let centerd = frame_of(&fitted, &photos).unwrap();
+    assert!(centerd.translation.length() < 0.1 && (0.8..1.25).contains(&centerd.scale), "{centerd:?}");
 }
 
 #[test]
 fn bad_input_is_refused() {
     let (cloud, views) = (ball(5, 1), ring(3, 16, &ball(5, 1)));
-    let fit_message = |views: &[View], cloud: Option<&Cloud>| {
+    let fit_message = |views: &[View], cloud: Option<&Gaussians>| {
         fit(views, cloud, &FitConfig { iterations: 1, ..Default::default() }, go).unwrap_err().to_string()
     };
-    let refine_message = |views: &[View], cloud: &Cloud| {
+    let refine_message = |views: &[View], cloud: &Gaussians| {
         refine(cloud, &[], views, &RefineConfig::default(), go).unwrap_err().to_string()
     };
     let both = |views: &[View], expected: &str| {
@@ -423,7 +423,7 @@ fn bad_input_is_refused() {
 
     let mut broken = cloud.clone();
     broken.rows_mut()[20] = f32::NAN;
-    for (bad, expected) in [(&broken, "NaN"), (&Cloud::default(), "no Gaussians")] {
+    for (bad, expected) in [(&broken, "NaN"), (&Gaussians::default(), "no Gaussians")] {
         for message in [fit_message(&views, Some(bad)), refine_message(&views, bad)] {
             assert!(message.contains(expected), "{message}");
         }

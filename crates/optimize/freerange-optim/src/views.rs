@@ -71,7 +71,7 @@ fn check(view: &Outline<'_>) -> Result<(), FitError> {
         let expected = format!("{} x {} pixels, the camera's size", c.width, c.height);
         return refuse(view, "image", expected, format!("{width} x {height}"));
     }
-    // The rasteriser's own limit.
+    // The rasterizer's own limit.
     if !(1..=16384).contains(&width) || !(1..=16384).contains(&height) {
         return refuse(view, "image", "1 to 16384 pixels a side".into(), format!("{width} x {height}"));
     }

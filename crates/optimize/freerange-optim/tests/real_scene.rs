@@ -1,7 +1,7 @@
 //! A rendered real object: fitted from 12 views and shown from 4 others, then spoilt and refined from those 4.
 //! `cargo test --release -p freerange-optim --test real_scene -- --ignored --nocapture` prints the figures.
 
-use freerange_gaussians::{Cloud, channel};
+use freerange_gaussians::{Gaussians, channel};
 use freerange_optim::{FitConfig, RefineConfig, fit, refine};
 use freerange_raster::{RasterConfig, render};
 use freerange_scene::camera::{Scene, View, image_ops};
@@ -20,7 +20,7 @@ fn views(file: &str, size: u32) -> Vec<View> {
 }
 
 /// Mean PSNR in dB over white.
-fn psnr(cloud: &Cloud, views: &[View]) -> f64 {
+fn psnr(cloud: &Gaussians, views: &[View]) -> f64 {
     let values = views.iter().map(|v| {
         let out = render(cloud.rows(), &[v.camera], &[[1.0; 3]], &RasterConfig::default()).unwrap();
         let shown: Vec<f32> = out.rgb.iter().map(|v| v.clamp(0.0, 1.0)).collect();

@@ -4,7 +4,7 @@ use std::{f64::consts::FRAC_PI_2, path::Path};
 
 use freerange_assets::mesh::{LoadLimits, Mesh, load_mesh};
 use freerange_assets::render::{Lighting, Scene};
-use freerange_gaussians::{Cloud, Splats, channel};
+use freerange_gaussians::{Gaussians, Splats, channel};
 use freerange_optim::meshing::{MeshConfig, mesh_of, save};
 use freerange_raster::{RasterConfig, render};
 use freerange_scene::camera::Camera;
@@ -12,7 +12,7 @@ use glam::{DQuat, DVec3, Vec3};
 
 /// Flat Gaussians on an egg with patches of color that no mirror leaves as they are.
 fn egg() -> Splats {
-    let mut cloud = Cloud::default();
+    let mut cloud = Gaussians::default();
     let n = 12000;
     for i in 0..n {
         let z = 1.0 - 2.0 * (f64::from(i) + 0.5) / f64::from(n);

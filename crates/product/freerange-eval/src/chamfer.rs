@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_optim::meshing::{MeshConfig, Shape, SurfaceError, mesh_of};
 use glam::Vec3;
 use rand::{Rng, SeedableRng};
@@ -28,7 +28,7 @@ const OFFSET: f32 = 1e-4;
 ///
 /// # Errors
 /// If the Gaussians cannot be rendered.
-pub fn mesh_metrics(cloud: &Cloud, truth: &MeshSurface) -> Result<Option<BTreeMap<String, f64>>, EvalError> {
+pub fn mesh_metrics(cloud: &Gaussians, truth: &MeshSurface) -> Result<Option<BTreeMap<String, f64>>, EvalError> {
     match mesh_of(&cloud.clone().into(), &MeshConfig::default()) {
         Ok(shape) => Ok(compare(&surface_of(&shape), truth)),
         Err(SurfaceError::Nothing { .. }) => Ok(None),
@@ -200,6 +200,6 @@ mod tests {
             let found = mesh_metrics(&shell(radius), &truth).unwrap().unwrap();
             check(&found, [off, off, off, f_score], 4e-3);
         }
-        assert_eq!(mesh_metrics(&Cloud::default(), &truth).unwrap(), None);
+        assert_eq!(mesh_metrics(&Gaussians::default(), &truth).unwrap(), None);
     }
 }

@@ -54,7 +54,7 @@ pub enum EvalError {
     /// Cameras or their choice.
     #[error(transparent)]
     Camera(#[from] freerange_scene::camera::CameraError),
-    /// The rasteriser.
+    /// The rasterizer.
     #[error(transparent)]
     Raster(#[from] freerange_raster::RasterError),
     /// The mesh of a result.

@@ -3,7 +3,7 @@
 use std::{collections::BTreeMap, time::Duration};
 
 use freerange_assets::mesh::Mesh;
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_raster::{RasterConfig, surface_depth};
 use freerange_scene::camera::{Camera, View};
 use glam::{DVec3, Vec3};
@@ -144,7 +144,7 @@ fn closest_point(p: Vec3, corners: &[Vec3; 3]) -> (Vec3, Vec3) {
 /// # Errors
 /// If the Gaussians cannot be rendered.
 pub fn surface_metrics(
-    cloud: &Cloud,
+    cloud: &Gaussians,
     truth: &MeshSurface,
     inputs: &[View],
     views: &[View],
@@ -176,7 +176,7 @@ pub fn surface_metrics(
 }
 
 /// The points of the Gaussians' surface that a camera sees, one per pixel.
-fn surface_points(cloud: &Cloud, camera: &Camera) -> Result<Vec<Vec3>, EvalError> {
+fn surface_points(cloud: &Gaussians, camera: &Camera) -> Result<Vec<Vec3>, EvalError> {
     let shrink = (f64::from(SIZE) / f64::from(camera.width.max(camera.height))).min(1.0);
     let side = |pixels: u32| ((f64::from(pixels) * shrink).round() as u32).max(1);
     let small = camera.resized(side(camera.width), side(camera.height));
@@ -275,8 +275,8 @@ pub(crate) mod tests {
     }
 
     /// Flat Gaussians on a sphere.
-    pub(crate) fn shell(radius: f32) -> Cloud {
-        let mut cloud = Cloud::default();
+    pub(crate) fn shell(radius: f32) -> Gaussians {
+        let mut cloud = Gaussians::default();
         let count = 12000;
         for i in 0..count {
             let z = 1.0 - (2 * i + 1) as f32 / count as f32;
@@ -314,6 +314,6 @@ pub(crate) mod tests {
         // Cameras on one side, which is what the input sees; nothing at all.
         let seen = surface_metrics(&shell(0.4), &truth, &around[..1], &around[..1]).unwrap();
         assert!(seen.contains_key("surface-seen"));
-        assert!(surface_metrics(&Cloud::default(), &truth, &around, &around).unwrap().is_empty());
+        assert!(surface_metrics(&Gaussians::default(), &truth, &around, &around).unwrap().is_empty());
     }
 }

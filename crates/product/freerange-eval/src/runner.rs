@@ -2,7 +2,7 @@
 
 use std::time::Instant;
 
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_raster::{RasterConfig, render};
 use freerange_scene::camera::{View, image_ops::composite};
 use freerange_util::Share;
@@ -19,7 +19,7 @@ use crate::{
     strip, surface_metrics,
 };
 
-/// The colour behind the object in everything that is measured or shown.
+/// The color behind the object in everything that is measured or shown.
 const WHITE: [f32; 3] = [1.0; 3];
 
 /// The objects to measure on, by number.
@@ -50,7 +50,7 @@ pub trait Method {
 #[derive(Clone, Debug)]
 pub struct Reconstructed {
     /// Seeds and Gaussians in the frame of the object's cameras.
-    pub clouds: Vec<(u64, Cloud)>,
+    pub clouds: Vec<(u64, Gaussians)>,
     /// What the user should know.
     pub notes: Vec<String>,
 }
@@ -289,7 +289,7 @@ fn vgg_features(
 
 /// A view of the Gaussians as a viewer shows it: clamped to the range of a picture. What is not a number stays so, and is
 /// refused where it is scored.
-fn shown(cloud: &Cloud, view: &View) -> Result<Vec<f32>, EvalError> {
+fn shown(cloud: &Gaussians, view: &View) -> Result<Vec<f32>, EvalError> {
     let rendered = render(cloud.rows(), &[view.camera], &[WHITE], &RasterConfig::default())?;
     Ok(rendered.rgb.iter().map(|x| x.clamp(0.0, 1.0)).collect())
 }

@@ -30,7 +30,7 @@ pub fn deviation(values: &[f64]) -> Option<f64> {
     Some((sum / (values.len() - 1) as f64).sqrt())
 }
 
-/// The value below which the share `q` of the sorted values lies, linear between neighbours. `sorted` is not empty.
+/// The value below which the share `q` of the sorted values lies, linear between neighbors. `sorted` is not empty.
 pub fn quantile(sorted: &[f64], q: f64) -> f64 {
     let at = q.clamp(0.0, 1.0) * (sorted.len() - 1) as f64;
     let (low, high) = (at.floor() as usize, at.ceil() as usize);
@@ -40,13 +40,13 @@ pub fn quantile(sorted: &[f64], q: f64) -> f64 {
 /// The mean of `values` with the percentile interval of [`RESAMPLES`] resamples with replacement (Efron 1979); `None` of
 /// no values. The same values and seed give the same interval.
 pub fn bootstrap(values: &[f64], seed: u64) -> Option<Interval> {
-    let centre = mean(values)?;
+    let center = mean(values)?;
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let n = values.len();
     let mut means: Vec<f64> =
         (0..RESAMPLES).map(|_| (0..n).map(|_| values[rng.random_range(0..n)]).sum::<f64>() / n as f64).collect();
     means.sort_unstable_by(f64::total_cmp);
-    Some(Interval { mean: centre, low: quantile(&means, 0.025), high: quantile(&means, 0.975) })
+    Some(Interval { mean: center, low: quantile(&means, 0.025), high: quantile(&means, 0.975) })
 }
 
 #[cfg(test)]

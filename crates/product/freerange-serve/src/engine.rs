@@ -2,7 +2,7 @@
 
 use std::ops::ControlFlow;
 
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_scene::camera::{Camera, FrameConfig, View};
 use freerange_scene::estimate::OthersShow;
 use image::RgbaImage;
@@ -37,7 +37,7 @@ pub trait Engine: Send + Sync + 'static {
     ///
     /// # Errors
     /// A sentence for the log.
-    fn picture(&self, cloud: &Cloud, camera: &Camera) -> Result<RgbaImage, String>;
+    fn picture(&self, cloud: &Gaussians, camera: &Camera) -> Result<RgbaImage, String>;
 }
 
 /// What is reconstructed from.
@@ -132,14 +132,14 @@ pub struct Step<'a> {
     pub loss: Option<f64>,
     /// The Gaussians of that sample by now, in the frame of the views; nothing where there are none yet. May cost something: it is
     /// called for those steps only that are shown.
-    pub preview: &'a dyn Fn() -> Result<Option<Cloud>, String>,
+    pub preview: &'a dyn Fn() -> Result<Option<Gaussians>, String>,
 }
 
 /// What came of a run.
 #[derive(Clone, Debug)]
 pub struct Outcome {
     /// Seed and Gaussians of each sample, in the frame of the views.
-    pub samples: Vec<(u64, Cloud)>,
+    pub samples: Vec<(u64, Gaussians)>,
     /// The direction of up in that frame.
     pub up: [f64; 3],
     /// What the user should know.

@@ -229,7 +229,7 @@ pub fn mend(folder: &Path, k: usize, png: &[u8]) -> Result<f64, Refusal> {
     let whole = picture(&whole_file(folder, k))?;
     let mut covered = 0u64;
     for ((pixel, photo), Luma([alpha])) in view.pixels_mut().zip(whole.pixels()).zip(mask.pixels()) {
-        // Where nothing was mended, the colours stay as they were cut out.
+        // Where nothing was mended, the colors stay as they were cut out.
         if pixel[3] != *alpha {
             *pixel = match *alpha {
                 0 => Rgba([0; 4]),

@@ -62,7 +62,7 @@ fn the_example_becomes_gaussians_while_one_watches() {
     assert_eq!((options.samples, options.seed), (Some(2), Some(3)));
     assert_eq!((options.iterations, options.init), (Some(200), None));
     let expected = Fake::cloud(4, 8);
-    // Colours are rounded in files.
+    // Colors are rounded in files.
     let alike = |rows: &[f32]| rows.iter().zip(expected.rows()).all(|(a, b)| (a - b).abs() < 1e-6);
     let rows = server.get(&format!("/jobs/{id}/samples/1")).body;
     let rows: Vec<f32> = rows.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect();

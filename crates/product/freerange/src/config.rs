@@ -4,7 +4,7 @@ use freerange_diffusion::{
     sample::{FlowConfig, RefinerConfig},
     settings::Settings,
 };
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_model::{Checkpoint, Compute};
 use freerange_optim::QuickFitConfig;
 use freerange_scene::camera::FrameConfig;
@@ -277,7 +277,7 @@ pub struct Options {
     /// One sample per seed.
     pub seeds: Vec<u64>,
     /// Gaussians to begin with instead of [`ProposeConfig::init`], in the frame of the views.
-    pub init: Option<Cloud>,
+    pub init: Option<Gaussians>,
     /// Which way is up in the views' frame, and where the object is, if that is known.
     pub frame: FrameConfig,
     /// Leave the network out: the control of comparisons.

@@ -223,7 +223,7 @@ impl DeviceName {
     }
 }
 
-/// The first device, from `number` on, that opens and is real hardware: a software rasteriser pretends to be a GPU, and is
+/// The first device, from `number` on, that opens and is real hardware: a software rasterizer pretends to be a GPU, and is
 /// slower than the CPU used directly.
 fn first_gpu<T>(
     found: impl IntoIterator<Item = (GpuApi, Vec<T>)>,

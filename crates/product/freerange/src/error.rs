@@ -194,7 +194,7 @@ impl Beneath for FitError {
             Self::Splat(e) => e.lift(),
             Self::Raster(e) => e.lift(),
             Self::Metrics(e) => e.lift(),
-            e @ Self::EmptyCloud => Error::Gaussians(Cause::of(e)),
+            e @ Self::NoGaussians => Error::Gaussians(Cause::of(e)),
             e @ Self::Diverged { .. } => Error::Computation(Cause::of(e)),
             e => Error::Scene(Cause::of(e)),
         }

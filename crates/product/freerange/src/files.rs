@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use freerange_gaussians::{
-    Cloud,
+    Gaussians,
     formats::{Frame, WriteOptions, read, write},
 };
 use freerange_util::Note;
@@ -16,7 +16,7 @@ use crate::{Error, error::Lift};
 ///
 /// # Errors
 /// Names the file, the place in it, what was expected and what was found.
-pub fn read_gaussians(path: &Path, up: DVec3) -> Result<(Cloud, Vec<Note>), Error> {
+pub fn read_gaussians(path: &Path, up: DVec3) -> Result<(Gaussians, Vec<Note>), Error> {
     let loaded = read(path, frame(up)?).lift()?;
     let mut notes: Vec<Note> = loaded.notes.into_iter().map(Note::understood).collect();
     let degree = loaded.splats.harmonics.degree();
@@ -32,7 +32,7 @@ pub fn read_gaussians(path: &Path, up: DVec3) -> Result<(Cloud, Vec<Note>), Erro
 ///
 /// # Errors
 /// Names the file, or the extension that no format has.
-pub fn write_gaussians(gaussians: &Cloud, path: &Path, up: DVec3) -> Result<Vec<Note>, Error> {
+pub fn write_gaussians(gaussians: &Gaussians, path: &Path, up: DVec3) -> Result<Vec<Note>, Error> {
     let options = WriteOptions { frame: frame(up)?, ..WriteOptions::default() };
     let lost = write(&gaussians.clone().into(), path, &options).lift()?;
     Ok(lost.into_iter().map(Note::dropped).collect())
@@ -53,7 +53,7 @@ mod tests {
         let folder = std::env::temp_dir().join(format!("freerange-files-{}", std::process::id()));
         std::fs::create_dir_all(&folder).unwrap();
         let rows = (0..4 * channel::COUNT).map(|v| (v as f32 * 0.7).sin()).collect();
-        let cloud = Cloud::from_rows(rows);
+        let cloud = Gaussians::from_rows(rows);
         for name in ["a.ply", "a.splat", "a.glb"] {
             let path = folder.join(name);
             write_gaussians(&cloud, &path, DVec3::Z).unwrap();

@@ -1,6 +1,6 @@
 //! The canonical frame: views into it, Gaussians out of it, and which of the views the network sees.
 
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_scene::camera::{CanonicalFrame, FrameConfig, Similarity, View, canonical_from_user, inputs_around};
 
 use crate::{Error, error::Lift};
@@ -43,7 +43,7 @@ pub fn to_canonical(views: &[View], config: &FrameConfig) -> Result<(CanonicalFr
 }
 
 /// Takes Gaussians from the canonical frame to the user's.
-pub fn to_user(cloud: &Cloud, canonical_from_user: &Similarity) -> Cloud {
+pub fn to_user(cloud: &Gaussians, canonical_from_user: &Similarity) -> Gaussians {
     let back = canonical_from_user.inverse();
     let mut cloud = cloud.clone();
     cloud.transform(back.scale, back.rotation, back.translation);

@@ -72,7 +72,7 @@ pub use error::{Cause, Error};
 pub use files::{read_gaussians, write_gaussians};
 pub use frame::{choose_views, to_canonical, to_user};
 pub use freerange_diffusion::sample::{FlowConfig, RefinerConfig, SETTINGS_SCHEMA};
-pub use freerange_gaussians::{Cloud, RenderMode, Splats};
+pub use freerange_gaussians::{Gaussians, RenderMode, Splats};
 pub use freerange_model::Compute;
 pub use freerange_optim::QuickFitConfig;
 pub use freerange_scene::camera::{Camera, CanonicalFrame, FrameConfig, Similarity, Up, View};

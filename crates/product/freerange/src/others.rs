@@ -2,7 +2,7 @@
 
 use std::ops::ControlFlow;
 
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_optim::{QuickFitConfig, quick_fit};
 use freerange_raster::RasterConfig;
 use freerange_scene::camera::{Camera, FrameConfig, View, Window};
@@ -11,7 +11,7 @@ use rayon::prelude::*;
 
 use crate::{Error, error::Lift, to_canonical};
 
-/// Shows each view as a quick fit of all the others has it: straight colour and alpha, at its image's size, in the order of `views`, whose
+/// Shows each view as a quick fit of all the others has it: straight color and alpha, at its image's size, in the order of `views`, whose
 /// alpha is the object's mask. What one mask lacks by mistake others have, and the other way round. (`freerange_scene::estimate::OthersShow`.)
 ///
 /// # Errors
@@ -37,12 +37,12 @@ fn shown(views: &[View]) -> Result<Vec<RgbaImage>, Error> {
         .collect()
 }
 
-/// The cloud in straight colour and alpha.
-fn picture(cloud: &Cloud, camera: &Camera) -> Result<RgbaImage, Error> {
+/// The cloud in straight color and alpha.
+fn picture(cloud: &Gaussians, camera: &Camera) -> Result<RgbaImage, Error> {
     let shown = freerange_raster::render(cloud.rows(), &[*camera], &[[0.0; 3]], &RasterConfig::default()).lift()?;
     let byte = |v: f32| (255.0 * v.clamp(0.0, 1.0)).round() as u8;
     let pixels = shown.rgb.as_chunks::<3>().0.iter().zip(&shown.alpha).map(|(rgb, &alpha)| {
-        // Over black, colours are multiplied by alpha.
+        // Over black, colors are multiplied by alpha.
         let [r, g, b] = rgb.map(|c| byte(c / alpha.max(1e-3)));
         Rgba([r, g, b, byte(alpha)])
     });

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use freerange_gaussians::{Cloud, RenderMode, Splats};
+use freerange_gaussians::{Gaussians, RenderMode, Splats};
 use freerange_raster::{MIP_BLUR, RasterConfig, mip_compensated, render};
 use freerange_scene::camera::{
     Camera,
@@ -14,19 +14,19 @@ use image::{Delay, Frame, RgbaImage, codecs::gif};
 
 use crate::{Error, error::Lift};
 
-/// The colour behind the object in everything that is measured or shown.
+/// The color behind the object in everything that is measured or shown.
 pub const WHITE: [f32; 3] = [1.0; 3];
 
-/// Renders one view on white. `[h, w, 3]`, colours as in the image files (sRGB-encoded), not clamped.
+/// Renders one view on white. `[h, w, 3]`, colors as in the image files (sRGB-encoded), not clamped.
 ///
 /// # Errors
-/// If the rasteriser refuses the camera or the cloud.
-pub fn render_view(cloud: &Cloud, camera: &Camera) -> Result<Vec<f32>, Error> {
+/// If the rasterizer refuses the camera or the cloud.
+pub fn render_view(cloud: &Gaussians, camera: &Camera) -> Result<Vec<f32>, Error> {
     Ok(render(cloud.rows(), &[*camera], &[WHITE], &in_units_of(cloud, camera)).lift()?.rgb)
 }
 
 /// Settings with a near plane for the cloud's own units: as usual from a distance of one unit on, in proportion below.
-fn in_units_of(cloud: &Cloud, camera: &Camera) -> RasterConfig {
+fn in_units_of(cloud: &Gaussians, camera: &Camera) -> RasterConfig {
     let usual = RasterConfig::default();
     let Some((low, high)) = cloud.bounds() else { return usual };
     let distance = camera.center().distance(0.5 * (low + high));
@@ -37,7 +37,7 @@ fn in_units_of(cloud: &Cloud, camera: &Camera) -> RasterConfig {
 /// `[h, w, 3]`, as [`render_view`].
 ///
 /// # Errors
-/// If the rasteriser refuses the camera or the cloud.
+/// If the rasterizer refuses the camera or the cloud.
 pub fn render_splats(splats: &Splats, camera: &Camera, mode: RenderMode) -> Result<Vec<f32>, Error> {
     let cloud = splats.seen_from(camera.center());
     // Positions are relative to the origin, which may be far away.
@@ -59,8 +59,8 @@ pub fn on_white(image: &RgbaImage) -> RgbaImage {
 /// Writes an animated GIF of the cloud, which is in the canonical frame, turning once about the z axis.
 ///
 /// # Errors
-/// If the file cannot be written, or the rasteriser refuses the cloud.
-pub fn write_turntable(path: &Path, cloud: &Cloud, frames: u32, size: u32) -> Result<(), Error> {
+/// If the file cannot be written, or the rasterizer refuses the cloud.
+pub fn write_turntable(path: &Path, cloud: &Gaussians, frames: u32, size: u32) -> Result<(), Error> {
     let file = std::fs::File::create(path).map_err(IoError::at(path)).lift()?;
     let mut encoder = gif::GifEncoder::new_with_speed(std::io::BufWriter::new(file), 10);
     let broken = |source: image::ImageError| Error::picture(path, source);
@@ -85,7 +85,7 @@ mod tests {
     /// A few Gaussians, as small as pixels.
     fn example(degree: usize) -> Splats {
         let wave = |n: usize| (0..n).map(|v| (v as f32 * 0.7).sin()).collect::<Vec<_>>();
-        let mut cloud = Cloud::from_rows(wave(30 * channel::COUNT));
+        let mut cloud = Gaussians::from_rows(wave(30 * channel::COUNT));
         for row in cloud.iter_mut() {
             row[channel::MEAN].iter_mut().for_each(|v| *v *= 0.4);
             row[channel::LOG_SCALE].iter_mut().for_each(|v| *v -= 4.0);

@@ -23,7 +23,7 @@ mod watch;
 use std::{ops::ControlFlow, path::Path};
 
 pub(crate) use canonical::CanonicalScene;
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_scene::camera::{Similarity, View};
 use freerange_util::Note;
 use glam::DVec3;
@@ -38,11 +38,11 @@ pub struct Sample {
     /// The seed it was drawn with.
     pub seed: u64,
     /// The Gaussians, in the frame of the views.
-    pub gaussians: Cloud,
+    pub gaussians: Gaussians,
     /// The first proposal as the network left it; none where no optimization followed.
-    pub before_optimization: Option<Cloud>,
+    pub before_optimization: Option<Gaussians>,
     /// `gaussians` in the canonical frame: around the origin within a radius of 0.5, +z up.
-    pub canonical: Cloud,
+    pub canonical: Gaussians,
 }
 
 /// A reconstruction and what it took.
@@ -118,7 +118,7 @@ impl Reconstructor {
             let result = watch.timed(Stage::Optimize, |w| {
                 optimize::optimize(&scene, &targets, &config.optimize, &refined, seed, w)
             })?;
-            let user = |cloud: &Cloud| to_user(cloud, &scene.canonical_from_user);
+            let user = |cloud: &Gaussians| to_user(cloud, &scene.canonical_from_user);
             let before_optimization = (config.optimize.iterations > 0).then(|| user(&refined[0]));
             samples.push(Sample { seed, gaussians: user(&result), before_optimization, canonical: result });
         }

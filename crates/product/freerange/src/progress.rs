@@ -3,7 +3,7 @@
 use std::fmt;
 
 use freerange_diffusion::sample::Estimate;
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_scene::camera::Similarity;
 
 use crate::{Error, error::Lift, to_user};
@@ -65,11 +65,11 @@ pub struct Progress<'a> {
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Preview<'a> {
     /// The state of a fit or of the optimization.
-    Fit(&'a Cloud),
+    Fit(&'a Gaussians),
     /// The network's estimate, on its device.
     Network(&'a Estimate<'a>),
     /// The same, read back.
-    Read(&'a [Cloud]),
+    Read(&'a [Gaussians]),
 }
 
 impl Progress<'_> {
@@ -79,7 +79,7 @@ impl Progress<'_> {
     ///
     /// # Errors
     /// If a device fails.
-    pub fn preview(&self) -> Result<Option<Cloud>, Error> {
+    pub fn preview(&self) -> Result<Option<Gaussians>, Error> {
         let Some((preview, place)) = self.preview else { return Ok(None) };
         let cloud = match preview {
             Preview::Fit(cloud) => Some(cloud.clone()),

@@ -1,6 +1,6 @@
 //! Scores of a result on views with known images.
 
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_raster::metrics::{capped_psnr, ssim_3dgs};
 use freerange_scene::camera::{View, image_ops::composite};
 use serde::Serialize;
@@ -37,7 +37,7 @@ pub struct Scores {
 ///
 /// # Errors
 /// If a render or a metric is refused, or Gaussians render as what is no number.
-pub fn score(cloud: &Cloud, views: &[View]) -> Result<Option<Scores>, Error> {
+pub fn score(cloud: &Gaussians, views: &[View]) -> Result<Option<Scores>, Error> {
     let scored = views
         .iter()
         .map(|view| {

@@ -3,7 +3,7 @@
 use std::{ops::ControlFlow, path::Path};
 
 use freerange::{
-    Camera, Choices, Cloud, Detect, Device, Error, Init, Options, Progress, Quality, Reconstructor, RefinerConfig,
+    Camera, Choices, Detect, Device, Error, Gaussians, Init, Options, Progress, Quality, Reconstructor, RefinerConfig,
     Scene, Similarity, Stage, View, score, to_canonical,
 };
 use freerange_scene::camera::{FrameConfig, Window};
@@ -80,11 +80,11 @@ fn every_step_is_reported_and_the_last_preview_is_the_result_in_the_users_frame(
     assert_eq!(stages, [Stage::Canonicalize, Stage::Symmetry, Stage::Propose, Stage::Refine, Stage::Optimize]);
     let of = |stage, sample| {
         let of = previews.iter().filter(move |e| (e.0, e.1) == (stage, sample));
-        of.map(|e| e.2.clone()).collect::<Vec<Cloud>>()
+        of.map(|e| e.2.clone()).collect::<Vec<Gaussians>>()
     };
     let fitted = of(Stage::Propose, 0);
     assert!(fitted.len() == 20 && fitted.windows(2).all(|pair| pair[0] != pair[1]));
-    let psnr = |cloud: &Cloud| score(cloud, &views).unwrap().unwrap().psnr;
+    let psnr = |cloud: &Gaussians| score(cloud, &views).unwrap().unwrap().psnr;
     let (before, after) = (psnr(&fitted[0]), psnr(&fitted[19]));
     assert!(before > 10.0 && after > before, "in the frame of the cameras, and better: {before} dB, {after} dB");
     for (i, sample) in result.samples.iter().enumerate() {
@@ -93,7 +93,7 @@ fn every_step_is_reported_and_the_last_preview_is_the_result_in_the_users_frame(
         assert!(refined.len() == 3 && &refined[2] == before && &refined[1] != before);
         assert!(optimized.len() == 4 && optimized[0] != optimized[3]);
         // But for the labels of axes, which are made canonical at the end.
-        let means = |cloud: &Cloud| (0..cloud.len()).map(|k| cloud.mean(k)).collect::<Vec<_>>();
+        let means = |cloud: &Gaussians| (0..cloud.len()).map(|k| cloud.mean(k)).collect::<Vec<_>>();
         assert_eq!(means(&optimized[3]), means(&sample.gaussians));
         let found = psnr(&sample.gaussians);
         assert!(found > 18.0, "{found} dB");
@@ -136,7 +136,8 @@ fn proposals_are_optimized_together() {
     assert_eq!(reports[1..1 + expected.len()], expected);
     // Proposals are worked on beside each other; previews show the first, which is what it is alone.
     for (stage, count) in [(Stage::Propose, 20), (Stage::Refine, 3)] {
-        let of = |all: &[(Stage, Cloud)]| all.iter().filter(|e| e.0 == stage).map(|e| e.1.clone()).collect::<Vec<_>>();
+        let of =
+            |all: &[(Stage, Gaussians)]| all.iter().filter(|e| e.0 == stage).map(|e| e.1.clone()).collect::<Vec<_>>();
         assert!(of(&previews).len() == count && of(&previews) == of(&own), "{stage}");
     }
     assert_eq!(alone.samples[0].before_optimization, together.samples[0].before_optimization);

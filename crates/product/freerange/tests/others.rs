@@ -29,7 +29,7 @@ fn the_others_know_what_a_mask_lacks_and_what_it_has_too_much() {
     let alpha = |x: u32, y: u32| f64::from(shown[0].get_pixel(x, y)[3]) / 255.0;
     assert!(mean(hole, &alpha) > 0.9, "{}", mean(hole, &alpha));
     assert!(mean(blot, &alpha) < 0.01, "{}", mean(blot, &alpha));
-    // In the bowl's own colour.
+    // In the bowl's own color.
     let off = |x: u32, y: u32| {
         let (a, b) = (shown[0].get_pixel(x, y), views[0].image.get_pixel(x, y));
         (0..3).map(|c| f64::from(a[c].abs_diff(b[c]))).sum::<f64>() / 3.0

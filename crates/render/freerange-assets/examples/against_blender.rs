@@ -2,7 +2,7 @@
 //! SHARED [OUTPUT]`, where SHARED holds `objects` and `views`; OUTPUT receives Blender's and our pictures side by side.
 //!
 //! Columns: overlap of the silhouettes (least and mean over the views), PSNR over white, Pearson's correlation and mean
-//! difference (ours minus Blender's, of 255) where both cover a pixel, and the last three again for base colours alone.
+//! difference (ours minus Blender's, of 255) where both cover a pixel, and the last three again for base colors alone.
 
 use std::path::PathBuf;
 
@@ -17,7 +17,7 @@ fn main() {
         std::process::exit(2);
     };
     let output = args.next();
-    println!("{:34} {:>6} {:>6} {:>6} {:>6} {:>6}  base colours", "", "IoU >=", "IoU", "PSNR", "corr", "bias");
+    println!("{:34} {:>6} {:>6} {:>6} {:>6} {:>6}  base colors", "", "IoU >=", "IoU", "PSNR", "corr", "bias");
     let mut table = Vec::new();
     for name in names(&shared) {
         let mesh = object(&shared, &name);

@@ -69,7 +69,7 @@ fn surfaces_of_every_family_are_closed_and_have_no_degenerate_triangles() {
         for seed in 0..25 {
             let mesh = generate(seed, &config).unwrap();
             // Every edge is passed as often in one direction as in the other. Vertices are told apart by position: the
-            // same point before normalisation is the same to the bit after it.
+            // same point before normalization is the same to the bit after it.
             let id = |v: u32| (mesh.positions[v as usize] + Vec3::ZERO).to_array().map(f32::to_bits);
             let mut edges: BTreeMap<_, i32> = BTreeMap::new();
             for (i, t) in mesh.triangles.iter().enumerate() {
@@ -162,7 +162,7 @@ fn cameras_frame_the_object_and_cover_what_they_should() {
         for c in &around {
             let distance = c.center().length();
             assert!((1.5..=2.0).contains(&distance));
-            // The object's centre projects near the middle.
+            // The object's center projects near the middle.
             let p = c.world_to_camera.transform_point3(glam::DVec3::ZERO);
             assert!(p.z > 1.4 && p.truncate().length() < 0.021);
         }
@@ -181,7 +181,7 @@ fn cameras_frame_the_object_and_cover_what_they_should() {
 }
 
 #[test]
-fn prints_show_marks_of_several_colours() {
+fn prints_show_marks_of_several_colors() {
     for kind in [Kind::Carton, Kind::Can, Kind::Pouch, Kind::Book] {
         let mut printed = 0;
         for seed in 0..10 {
@@ -197,12 +197,12 @@ fn prints_show_marks_of_several_colours() {
                 printed += usize::from(colors.len() >= 3);
             }
         }
-        assert!(printed >= 10, "{kind:?}: {printed} prints with three colours");
+        assert!(printed >= 10, "{kind:?}: {printed} prints with three colors");
     }
 }
 
 #[test]
-fn without_prints_an_object_keeps_its_shape_and_the_mean_colours_of_its_prints() {
+fn without_prints_an_object_keeps_its_shape_and_the_mean_colors_of_its_prints() {
     let plain = GeneratorConfig { prints: false, ..GeneratorConfig::default() };
     let mut replaced = 0;
     for seed in 0..40 {

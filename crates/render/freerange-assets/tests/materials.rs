@@ -126,7 +126,7 @@ fn opaque([r, g, b]: [u8; 3]) -> [u8; 4] {
 }
 
 #[test]
-fn factors_and_vertex_colours_multiply() {
+fn factors_and_vertex_colors_multiply() {
     let material = Material { factor: Vec4::new(0.5, 1.0, 1.0, 1.0), ..flat(0.6) };
     let mut mesh = square(0.0, material);
     mesh.colors = vec![Vec4::new(1.0, 0.25, 0.0, 1.0); 4];
@@ -177,7 +177,7 @@ fn metals_and_emission_follow_their_maps() {
     // A map that makes a metal of a matt material, and the other way round.
     let metal =
         |blue: u8| Material { metallic: 1.0, metallic_roughness: Some(plain([0, 30, blue, 255], false)), ..flat(0.5) };
-    // A smooth metal under light from everywhere shows its colour too.
+    // A smooth metal under light from everywhere shows its color too.
     let sky = code(0.5 * 0.8);
     for blue in [0, 255] {
         let pixel = seen(square(0.0, metal(blue)), &SKY, 1.6).get_pixel(16, 16).0;

@@ -1,4 +1,4 @@
-//! How fast the rasteriser is. `cargo bench -p freerange-raster --bench raster -- [FILTER] [--threads N]`.
+//! How fast the rasterizer is. `cargo bench -p freerange-raster --bench raster -- [FILTER] [--threads N]`.
 //!
 //! The scene: Gaussians as a fitted object has them, flat and small, tiling a bumpy surface of radius 0.5, seen from 1.5
 //! away with a field of view of 49 degrees. FILTER keeps rows whose name contains it, such as `n=2048` or `px=64`.

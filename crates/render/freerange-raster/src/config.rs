@@ -1,6 +1,6 @@
 //! Settings of the image model.
 
-/// Settings of the rasteriser; the defaults are gsplat's.
+/// Settings of the rasterizer; the defaults are gsplat's.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RasterConfig {
     /// Gaussians with a smaller camera z are culled. World units.

@@ -47,7 +47,7 @@ pub enum RasterError {
         /// Which view.
         view: usize,
     },
-    /// A background colour is not finite.
+    /// A background color is not finite.
     #[error("the background of view {view} is not finite")]
     Background {
         /// Which view.

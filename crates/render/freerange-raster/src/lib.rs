@@ -1,11 +1,11 @@
-//! A differentiable rasteriser of 3D Gaussians.
+//! A differentiable rasterizer of 3D Gaussians.
 //!
 //! A Gaussian has 14 channels, in this order: mean (3, world units), natural logarithm of the standard deviation along
 //! each local axis (3), rotation from the local axes to the world's as a quaternion `w x y z` of any length (4), logit of
-//! the opacity, colour (3). Gradients are analytic and reach all 14.
+//! the opacity, color (3). Gradients are analytic and reach all 14.
 //!
 //! The image model is that of 3D Gaussian splatting (Kerbl et al. 2023) as gsplat computes it: the projected covariance
-//! is that of the linearised projection plus [`RasterConfig::blur`]; Gaussians are blended from near to far by camera z
+//! is that of the linearized projection plus [`RasterConfig::blur`]; Gaussians are blended from near to far by camera z
 //! (ties in index order); a splat's opacity at a pixel is at most 0.99, and ignored below 1/255; blending stops before the
 //! splat that would take the transmittance to 1e-4 or below.
 //!

@@ -26,7 +26,7 @@ use std::{
 };
 
 /// Renders `gaussians` `[objects, n, 14]` (channels as in [`crate`]) with `cameras[object][view]`, in front of
-/// `backgrounds[object][view]`. Returns `[objects, views, height, width, 4]`: colour over the background, and alpha.
+/// `backgrounds[object][view]`. Returns `[objects, views, height, width, 4]`: color over the background, and alpha.
 ///
 /// Differentiable once in `gaussians`. All objects have the same number of views, and all views the same size in pixels.
 /// What [`crate::render`] says about values that are not finite holds here as well; [`RasterConfig::depth`] is ignored.
@@ -119,7 +119,7 @@ fn saved_or<S: Any + Send + Sync>(saved: &Saved, forward: impl FnOnce() -> S) ->
     state.downcast_ref().expect("forward and backward pass on the same backend")
 }
 
-/// The backends that can rasterise.
+/// The backends that can rasterize.
 #[backend_extension(Flex, Cube: cfg(feature = "gpu"), Autodiff)]
 pub trait RasterOps: Backend {
     /// `[objects, n, 14]` to `[objects, views, height, width, 4]`.
@@ -213,6 +213,6 @@ impl<B: RasterOps, C: CheckpointStrategy> RasterOps for Autodiff<B, C> {
     }
 
     fn rasterize_backward(_: FloatTensor<Self>, _: FloatTensor<Self>, _: Arc<Job>, _: Saved) -> FloatTensor<Self> {
-        panic!("the rasteriser can be differentiated once only")
+        panic!("the rasterizer can be differentiated once only")
     }
 }

@@ -1,4 +1,4 @@
-//! The rasteriser again, as plainly as possible: f64, one pixel after the other, every Gaussian at every pixel, and
+//! The rasterizer again, as plainly as possible: f64, one pixel after the other, every Gaussian at every pixel, and
 //! derivatives of the projection by forward-mode differentiation. It is what the fast paths are tested against.
 
 use crate::{CHANNELS, RasterConfig};
@@ -238,7 +238,7 @@ fn project(index: usize, row: &[f32; CHANNELS], camera: &Camera, blur: f64) -> S
         channel[0] * matrix[r][0] + channel[1] * matrix[r][1] + channel[2] * matrix[r][2] + Dual::constant(matrix[r][3])
     });
 
-    // The projection, linearised at the mean, but not further out than 15 % of the image size beyond its border
+    // The projection, linearized at the mean, but not further out than 15 % of the image size beyond its border
     let (width, height) = (f64::from(camera.width), f64::from(camera.height));
     let slope = |v: Dual, focal: f64, center: f64, size: f64| {
         (v / pz).clamp(-(center + 0.15 * size) / focal, (size - center + 0.15 * size) / focal)

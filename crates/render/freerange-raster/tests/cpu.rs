@@ -1,4 +1,4 @@
-//! The fast rasteriser against the slow one, on random scenes, and on inputs that nobody should have made.
+//! The fast rasterizer against the slow one, on random scenes, and on inputs that nobody should have made.
 
 mod common;
 

@@ -1,4 +1,4 @@
-//! Both rasterisers for processors against vectors from an independent reference; `gpu.rs` does the same for GPUs.
+//! Both rasterizers for processors against vectors from an independent reference; `gpu.rs` does the same for GPUs.
 
 #[path = "common/golden.rs"]
 mod golden;

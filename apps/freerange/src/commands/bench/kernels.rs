@@ -1,4 +1,4 @@
-//! The rasteriser and the transformer block by themselves.
+//! The rasterizer and the transformer block by themselves.
 
 use std::path::Path;
 
@@ -13,7 +13,7 @@ use serde::Serialize;
 use super::{ms, timer::Timer};
 use crate::{error::CliError, runtime::TrainConfig};
 
-/// A line about the rasteriser.
+/// A line about the rasterizer.
 #[derive(Serialize)]
 pub struct Raster {
     gaussians: usize,
@@ -73,7 +73,7 @@ fn cameras(count: usize, size: u32) -> Vec<Camera> {
         .collect()
 }
 
-/// Times the rasteriser on one object in `images` views.
+/// Times the rasterizer on one object in `images` views.
 pub fn raster(timer: &Timer, n: usize, images: usize, pixels: u32) -> Result<Raster, CliError> {
     let (cameras, backgrounds) = (vec![cameras(images, pixels)], vec![vec![[1.0; 3]; images]]);
     let config = RasterConfig::default();

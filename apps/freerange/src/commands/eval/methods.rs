@@ -11,7 +11,7 @@ use freerange_eval::{
     record::{Case, ViewSet},
     runner::{self, Reconstructed},
 };
-use freerange_gaussians::{Cloud, read_ply};
+use freerange_gaussians::{Gaussians, read_ply};
 use freerange_optim::{FitConfig, Rates, fit};
 use serde_json::{Value, json};
 
@@ -126,7 +126,7 @@ impl Method {
                 notes = frame.notes.clone();
                 seeds.iter().map(fitted).collect::<Result<_, CliError>>()?
             }
-            Self::White => vec![(0, Cloud::default())],
+            Self::White => vec![(0, Gaussians::default())],
             Self::Ply(folder) => {
                 let file = read_ply(&ply_file(folder, &case.object, case.views)?)?;
                 notes = file.notes;

@@ -7,7 +7,7 @@ use std::{
 
 use freerange::{DeviceName, EncoderPlaces, Reconstructor, View, pictures::render_view};
 use freerange_eval::{EvalObject, record::ViewSet, runner::Objects};
-use freerange_gaussians::{Cloud, channel};
+use freerange_gaussians::{Gaussians, channel};
 use freerange_scene::camera::image_ops::{composite, resize_area, sheet, shrunk_size, to_picture};
 use image::RgbaImage;
 use rand::{Rng, SeedableRng};
@@ -123,7 +123,7 @@ fn small(image: &RgbaImage) -> RgbaImage {
 }
 
 /// The visible Gaussians, a quarter as large, opaque, each in a color of its own.
-fn told_apart(cloud: &Cloud) -> Cloud {
+fn told_apart(cloud: &Gaussians) -> Gaussians {
     let mut rng = ChaCha8Rng::seed_from_u64(0);
     let mut rows = Vec::new();
     for row in cloud.rows().as_chunks::<{ channel::COUNT }>().0 {
@@ -136,7 +136,7 @@ fn told_apart(cloud: &Cloud) -> Cloud {
         row[channel::COLOR].iter_mut().for_each(|c| *c = rng.random());
         rows.extend(row);
     }
-    Cloud::from_rows(rows)
+    Gaussians::from_rows(rows)
 }
 
 fn save(picture: &RgbaImage, path: &Path) -> Result<(), CliError> {

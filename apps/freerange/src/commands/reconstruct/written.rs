@@ -1,6 +1,6 @@
 //! What results are written as, besides `gaussians.ply`.
 
-use freerange::{Cloud, View};
+use freerange::{Gaussians, View};
 use freerange_gaussians::Splats;
 use freerange_gaussians::formats::{Format, Frame, WriteOptions};
 use freerange_optim::meshing::{MeshConfig, MeshFormat, mesh_of, save};
@@ -48,7 +48,7 @@ impl std::fmt::Display for Written {
 const FAINT: f64 = 0.1;
 
 /// Gaussians as points: middles and colors.
-fn points(cloud: &Cloud) -> Vec<(glam::DVec3, [u8; 3])> {
+fn points(cloud: &Gaussians) -> Vec<(glam::DVec3, [u8; 3])> {
     let byte = |v: f64| (255.0 * v.clamp(0.0, 1.0)).round() as u8;
     let solid = (0..cloud.len()).filter(|i| cloud.opacity(*i) >= FAINT);
     solid.map(|i| (cloud.mean(i), cloud.color(i).to_array().map(byte))).collect()

@@ -36,6 +36,6 @@ pub enum FormatError {
 
 /// What is wrong with the bytes of a file.
 pub fn problem(field: impl Into<String>, expected: impl Into<String>, found: impl Display) -> Invalid {
-    // Enough to recognise it by; what is found may be long.
+    // Enough to recognize it by; what is found may be long.
     Invalid::new(field, expected, found.to_string().chars().take(120).collect::<String>())
 }

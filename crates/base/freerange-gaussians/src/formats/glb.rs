@@ -6,7 +6,7 @@
 //! show points only. Where positions are relative to an origin far away, the node's translation (of 64 bits) is it.
 //! Source: the Khronos registry of extensions.
 
-use crate::{Cloud, Splats, channel, coefficients};
+use crate::{Gaussians, Splats, channel, coefficients};
 use glam::DVec3;
 use serde_json::{Value, json};
 
@@ -96,7 +96,7 @@ fn container(mut json: Vec<u8>, mut binary: Vec<u8>) -> Vec<u8> {
 }
 
 struct Builder<'a> {
-    cloud: &'a Cloud,
+    cloud: &'a Gaussians,
     binary: Vec<u8>,
     views: Vec<Value>,
     accessors: Vec<Value>,

@@ -3,7 +3,7 @@
 
 use std::{borrow::Cow, collections::HashMap};
 
-use crate::{Cloud, Harmonics, MAX_DEGREE, Splats, channel, coefficients};
+use crate::{Gaussians, Harmonics, MAX_DEGREE, Splats, channel, coefficients};
 use base64::{Engine, engine::general_purpose::STANDARD};
 use freerange_util::Invalid;
 use glam::{DMat3, DMat4, DQuat, DVec3};
@@ -287,7 +287,7 @@ impl File<'_> {
             row[channel::COLOR].copy_from_slice(&vector(&colors).to_array().map(color_of_sh));
             rows.extend(row);
         }
-        let mut part = Splats { harmonics, ..Cloud::from_rows(rows).into() };
+        let mut part = Splats { harmonics, ..Gaussians::from_rows(rows).into() };
         part.harmonics.turn(DMat3::from_quat(place.rotation));
         if linear {
             encode_srgb(&mut part);

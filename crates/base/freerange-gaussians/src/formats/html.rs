@@ -3,7 +3,7 @@
 //! The Gaussians are the 14 channels as little-endian floats in base64, in the user's frame; the page turns them about
 //! `up`.
 
-use crate::{Cloud, channel};
+use crate::{Gaussians, channel};
 use base64::{Engine, engine::general_purpose::STANDARD};
 use freerange_util::Invalid;
 use sha2::{Digest, Sha256};
@@ -18,7 +18,7 @@ const SCRIPT: &str = crate::formats::viewer::SCRIPT;
 const BEFORE: &str = "<script type=\"application/octet-stream\" id=\"gaussians\" data-up=\"";
 const AFTER: &str = "</script>";
 
-pub fn encode(cloud: &Cloud, frame: Frame) -> Encoded {
+pub fn encode(cloud: &Gaussians, frame: Frame) -> Encoded {
     let bytes: Vec<u8> = cloud.rows().iter().flat_map(|v| v.to_le_bytes()).collect();
     let up = frame.up().to_array().map(|v| (v * 1e9).round() / 1e9 + 0.0).map(|v| v.to_string()).join(" ");
     let data = format!("{BEFORE}{up}\">{}{AFTER}", STANDARD.encode(bytes));
@@ -63,5 +63,5 @@ pub fn decode(bytes: &[u8]) -> Result<Decoded, Invalid> {
     }
     let values = data.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect::<Vec<_>>();
     debug_assert!(values.len().is_multiple_of(channel::COUNT));
-    Ok(Decoded { splats: Cloud::from_rows(values).into(), ..Decoded::default() })
+    Ok(Decoded { splats: Gaussians::from_rows(values).into(), ..Decoded::default() })
 }

@@ -2,7 +2,7 @@
 
 use std::io::{Cursor, Read};
 
-use crate::{Cloud, Harmonics, MAX_DEGREE, RenderMode, Splats, channel, coefficients};
+use crate::{Gaussians, Harmonics, MAX_DEGREE, RenderMode, Splats, channel, coefficients};
 use freerange_util::Invalid;
 use image_webp::WebPDecoder;
 use zip::ZipArchive;
@@ -99,7 +99,7 @@ pub fn decode(bytes: &[u8], beside: &Beside) -> Result<Decoded, Invalid> {
         Some(harmonic) => harmonics(harmonic, &mut files, count)?,
         None => Harmonics::default(),
     };
-    let splats = Splats { harmonics, mode, ..Cloud::from_rows(rows).into() };
+    let splats = Splats { harmonics, mode, ..Gaussians::from_rows(rows).into() };
     Ok(Decoded { splats, notes, frame: None })
 }
 

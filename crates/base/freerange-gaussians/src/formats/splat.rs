@@ -3,7 +3,7 @@
 //! Position `f32 x 3`, standard deviations `f32 x 3`, color and opacity `u8 x 4`, rotation `w x y z` as `u8 x 4`
 //! around 128. The layout is that of the viewer by Kwok (github.com/antimatter15/splat), which has no other document.
 
-use crate::{Cloud, channel};
+use crate::{Gaussians, channel};
 use freerange_util::Invalid;
 
 use crate::formats::{
@@ -14,7 +14,7 @@ use crate::formats::{
 
 const BYTES: usize = 32;
 
-pub fn encode(cloud: &Cloud) -> Encoded {
+pub fn encode(cloud: &Gaussians) -> Encoded {
     // Viewers that stream show what comes first while the rest arrives.
     let weight: Vec<f64> = (0..cloud.len()).map(|i| cloud.scale(i).element_product() * cloud.opacity(i)).collect();
     let mut order: Vec<usize> = (0..cloud.len()).collect();
@@ -59,7 +59,7 @@ pub fn decode(bytes: &[u8]) -> Result<Decoded, Invalid> {
         set_rotation(&mut row, [4, 5, 6, 7].map(|k| (f64::from(small[k]) - 128.0) / 128.0));
         cloud.extend(row);
     }
-    Ok(Decoded { splats: Cloud::from_rows(cloud).into(), ..Decoded::default() })
+    Ok(Decoded { splats: Gaussians::from_rows(cloud).into(), ..Decoded::default() })
 }
 
 /// A sentence for the user if anything was clipped.

@@ -8,7 +8,7 @@
 
 use std::io::Write;
 
-use crate::{Cloud, RenderMode, Splats, channel};
+use crate::{Gaussians, RenderMode, Splats, channel};
 use flate2::{Compression, write::GzEncoder};
 use ruzstd::encoding::{CompressionLevel, compress_to_vec};
 
@@ -148,7 +148,7 @@ impl Packed {
 
 /// Bits behind the point of positions, and how many Gaussians lie too far away even so. Steps are a 2^17th of the
 /// object where that fits: finer ones would only compress worse. Readers want 1 to 24.
-fn fractional_bits(cloud: &Cloud) -> (u8, usize) {
+fn fractional_bits(cloud: &Gaussians) -> (u8, usize) {
     let Some((low, high)) = cloud.bounds() else { return (12, 0) };
     let size = (high - low).max_element();
     let farthest = low.abs().max(high.abs()).max_element();

@@ -2,7 +2,7 @@
 
 use std::io::Read;
 
-use crate::{Cloud, Harmonics, MAX_DEGREE, RenderMode, Splats, channel, coefficients};
+use crate::{Gaussians, Harmonics, MAX_DEGREE, RenderMode, Splats, channel, coefficients};
 use flate2::bufread::GzDecoder;
 use freerange_util::Invalid;
 use glam::{DMat3, DQuat, DVec3};
@@ -275,7 +275,7 @@ fn unpack(header: &Header, streams: [&[u8]; 6]) -> Result<Splats, Invalid> {
     let (width, all) = (3 * coefficients(degree), 3 * coefficients(header.degree));
     let kept = |row: &[u8]| row[..width].iter().map(|v| (f32::from(*v) - 128.0) / 128.0).collect::<Vec<_>>();
     let harmonics = harmonics.chunks_exact(all.max(1)).flat_map(kept).collect();
-    Ok(Splats { harmonics: Harmonics::from_rows(degree, harmonics), ..Cloud::from_rows(rows).into() })
+    Ok(Splats { harmonics: Harmonics::from_rows(degree, harmonics), ..Gaussians::from_rows(rows).into() })
 }
 
 /// Version 3 and later: `x y z w`.

@@ -8,7 +8,7 @@ use std::{
     io::{Cursor, Read},
 };
 
-use crate::{Cloud, Harmonics, MAX_DEGREE, Splats, channel, coefficients};
+use crate::{Gaussians, Harmonics, MAX_DEGREE, Splats, channel, coefficients};
 use freerange_util::Invalid;
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use zip::ZipArchive;
@@ -150,7 +150,7 @@ impl Stage {
             row[channel::LOGIT_OPACITY] = logit(opacities[i].into());
             rows.extend(row);
         }
-        found.splats.append(&Splats { harmonics, ..Cloud::from_rows(rows).into() });
+        found.splats.append(&Splats { harmonics, ..Gaussians::from_rows(rows).into() });
         Ok(())
     }
 

@@ -1,15 +1,15 @@
 //! An object without any symmetry, and how near two clouds are.
 #![allow(dead_code, reason = "each test uses a part")]
 
-use freerange_gaussians::{Cloud, channel};
+use freerange_gaussians::{Gaussians, channel};
 use glam::DQuat;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// Three arms of different lengths and colours along +x, +y and +z, of Gaussians of all shapes.
-pub fn object(n: usize) -> Cloud {
+/// Three arms of different lengths and colors along +x, +y and +z, of Gaussians of all shapes.
+pub fn object(n: usize) -> Gaussians {
     let mut rng = ChaCha8Rng::seed_from_u64(5);
-    let mut cloud = Cloud::default();
+    let mut cloud = Gaussians::default();
     for i in 0..n {
         let arm = i % 3;
         let along = rng.random_range(0.0..[0.45f32, 0.3, 0.2][arm]);
@@ -38,7 +38,7 @@ pub struct Difference {
     pub color: f64,
 }
 
-pub fn difference(a: &Cloud, b: &Cloud) -> Difference {
+pub fn difference(a: &Gaussians, b: &Gaussians) -> Difference {
     assert_eq!(a.len(), b.len());
     let most = |f: &dyn Fn(usize) -> f64| (0..a.len()).map(f).fold(0.0, f64::max);
     Difference {

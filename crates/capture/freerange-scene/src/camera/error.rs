@@ -65,7 +65,7 @@ pub enum CameraError {
         /// What is there.
         found: String,
     },
-    /// A feature that is recognised and not supported.
+    /// A feature that is recognized and not supported.
     #[error("{place}: {feature} is not supported; {advice}")]
     Unsupported {
         /// Where.
@@ -150,7 +150,7 @@ pub enum CameraError {
     },
     /// All images are taken from one point.
     #[error("{place}: all {count} cameras stand at one point; expected views from different places")]
-    SameCentre {
+    SameCenter {
         /// Where.
         place: Place,
         /// The number of cameras.

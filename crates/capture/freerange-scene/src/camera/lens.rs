@@ -311,7 +311,7 @@ fn redraw(image: &RgbaImage, size: (u32, u32), from: impl Fn(f64, f64) -> Option
     out
 }
 
-/// The image at a point in pixels (centres at +0.5); transparent outside, with the border pixels' own half extent kept.
+/// The image at a point in pixels (centers at +0.5); transparent outside, with the border pixels' own half extent kept.
 fn sample(image: &RgbaImage, x: f64, y: f64) -> Rgba<u8> {
     let (w, h) = (f64::from(image.width()), f64::from(image.height()));
     if !((0.0..=w).contains(&x) && (0.0..=h).contains(&y)) {
@@ -337,6 +337,6 @@ fn sample(image: &RgbaImage, x: f64, y: f64) -> Rgba<u8> {
     if sum[3] < 0.5 {
         return Rgba([0; 4]);
     }
-    let colour = |c: usize| (sum[c] / sum[3]).round() as u8;
-    Rgba([colour(0), colour(1), colour(2), sum[3].round() as u8])
+    let color = |c: usize| (sum[c] / sum[3]).round() as u8;
+    Rgba([color(0), color(1), color(2), sum[3].round() as u8])
 }

@@ -2,7 +2,7 @@
 
 use glam::{DMat4, DVec3, DVec4};
 
-/// A pinhole camera. Axes are OpenCV's: x right, y down, z forward; pixel centres lie at +0.5.
+/// A pinhole camera. Axes are OpenCV's: x right, y down, z forward; pixel centers lie at +0.5.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Camera {
     /// Image width in pixels.
@@ -41,7 +41,7 @@ impl Camera {
         }
     }
 
-    /// The centre of projection in world coordinates.
+    /// The center of projection in world coordinates.
     pub fn center(&self) -> DVec3 {
         let r = glam::DMat3::from_mat4(self.world_to_camera);
         -(r.transpose() * self.world_to_camera.w_axis.truncate())
@@ -68,7 +68,7 @@ impl Camera {
     }
 }
 
-/// A posed image: sRGB-encoded colour with straight alpha, and the camera that took it.
+/// A posed image: sRGB-encoded color with straight alpha, and the camera that took it.
 #[derive(Clone, Debug)]
 pub struct View {
     /// What the user knows it by: the file name without its extension.

@@ -3,7 +3,7 @@
 use crate::camera::Camera;
 use glam::{DMat3, DVec3};
 
-/// `(o x d, d)` for the centre of each patch of a grid over the whole image: `[rows, columns, 6]`; `o` is the camera centre and `d` the ray's unit
+/// `(o x d, d)` for the center of each patch of a grid over the whole image: `[rows, columns, 6]`; `o` is the camera center and `d` the ray's unit
 /// direction, both in the frame that the camera's extrinsics start from. `rows = height`, `columns = width` gives
 /// one ray per pixel.
 pub fn plucker(camera: &Camera, columns: usize, rows: usize) -> Vec<f32> {

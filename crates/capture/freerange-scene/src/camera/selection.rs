@@ -1,6 +1,6 @@
 //! Which of an object's views are shown to the model and which only score it.
 //!
-//! K-means on the camera centres; "full observation" shows one view of each cluster, "partial observation" only
+//! K-means on the camera centers; "full observation" shows one view of each cluster, "partial observation" only
 //! views of one cluster, and one fixed, broad set of other views scores both.
 
 use crate::camera::CameraError;
@@ -54,12 +54,12 @@ pub fn k_means(points: &[DVec3], k: usize, restarts: usize, rng: &mut impl Rng) 
     best
 }
 
-/// k-means++ (Arthur and Vassilvitskii 2007): each next centre is drawn by its squared distance to those before it.
+/// k-means++ (Arthur and Vassilvitskii 2007): each next center is drawn by its squared distance to those before it.
 fn plus_plus(points: &[DVec3], k: usize, rng: &mut impl Rng) -> Vec<DVec3> {
-    let mut centres = vec![points[rng.random_range(0..points.len())]];
+    let mut centers = vec![points[rng.random_range(0..points.len())]];
     let mut nearest = vec![f64::INFINITY; points.len()];
-    while centres.len() < k {
-        let last = centres[centres.len() - 1];
+    while centers.len() < k {
+        let last = centers[centers.len() - 1];
         for (d, p) in nearest.iter_mut().zip(points) {
             *d = d.min(p.distance_squared(last));
         }
@@ -68,35 +68,35 @@ fn plus_plus(points: &[DVec3], k: usize, rng: &mut impl Rng) -> Vec<DVec3> {
             left -= d;
             left < 0.0
         });
-        centres.push(points[chosen.unwrap_or(points.len() - 1)]);
+        centers.push(points[chosen.unwrap_or(points.len() - 1)]);
     }
-    centres
+    centers
 }
 
-fn lloyd(points: &[DVec3], mut centres: Vec<DVec3>) -> (Vec<usize>, f64) {
+fn lloyd(points: &[DVec3], mut centers: Vec<DVec3>) -> (Vec<usize>, f64) {
     let mut labels = vec![usize::MAX; points.len()];
     for _ in 0..1000 {
         let next: Vec<usize> = points
             .iter()
             .map(|p| {
-                let distance = |c: &usize| p.distance_squared(centres[*c]);
-                (0..centres.len()).min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap_or(0)
+                let distance = |c: &usize| p.distance_squared(centers[*c]);
+                (0..centers.len()).min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap_or(0)
             })
             .collect();
         let settled = next == labels;
         labels = next;
-        for (c, centre) in centres.iter_mut().enumerate() {
+        for (c, center) in centers.iter_mut().enumerate() {
             let own = points.iter().zip(&labels).filter(|(_, l)| **l == c).map(|(p, _)| *p);
             let (sum, count) = own.fold((DVec3::ZERO, 0), |(s, n), p| (s + p, n + 1));
             if count > 0 {
-                *centre = sum / f64::from(count);
+                *center = sum / f64::from(count);
             }
         }
         if settled {
             break;
         }
     }
-    let inertia = points.iter().zip(&labels).map(|(p, &l)| p.distance_squared(centres[l])).sum();
+    let inertia = points.iter().zip(&labels).map(|(p, &l)| p.distance_squared(centers[l])).sum();
     (labels, inertia)
 }
 
@@ -112,7 +112,7 @@ pub fn select_views(centers: &[DVec3], target: DVec3, config: &SelectionConfig) 
         return refuse("at least 2 inputs and 1 validation view".into(), format!("{k} and {}", config.validation));
     }
     if let Some(i) = centers.iter().position(|c| !c.is_finite() || *c == target) {
-        return refuse("finite camera centres away from the object".into(), format!("camera {i} at {}", centers[i]));
+        return refuse("finite camera centers away from the object".into(), format!("camera {i} at {}", centers[i]));
     }
     if n < 2 * k {
         return refuse(format!("at least {} cameras for {k} inputs", 2 * k), format!("{n}"));
@@ -121,7 +121,7 @@ pub fn select_views(centers: &[DVec3], target: DVec3, config: &SelectionConfig) 
     let (labels, _) = k_means(centers, k, config.restarts, &mut rng);
     let members: Vec<Vec<usize>> = (0..k).map(|c| (0..n).filter(|&i| labels[i] == c).collect()).collect();
     if members.iter().any(Vec::is_empty) {
-        return refuse(format!("at least {k} distinct camera centres"), "fewer".into());
+        return refuse(format!("at least {k} distinct camera centers"), "fewer".into());
     }
 
     let full: Vec<usize> = members.iter().map(|own| nearest_to_mean(centers, own)).collect();
@@ -143,18 +143,18 @@ pub fn select_views(centers: &[DVec3], target: DVec3, config: &SelectionConfig) 
     Ok(ViewSets { labels, full, partial, validation })
 }
 
-/// The member that is nearest to the mean of the members' centres. `members` is not empty.
+/// The member that is nearest to the mean of the members' centers. `members` is not empty.
 fn nearest_to_mean(centers: &[DVec3], members: &[usize]) -> usize {
     let mean = members.iter().map(|&i| centers[i]).sum::<DVec3>() / members.len() as f64;
     let distance = |i: &usize| centers[*i].distance_squared(mean);
     members.iter().copied().min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap_or(members[0])
 }
 
-/// `count` inputs among `candidates` that see the object from all around: the candidates' centres in `count` clusters by
+/// `count` inputs among `candidates` that see the object from all around: the candidates' centers in `count` clusters by
 /// [`k_means`], and of each the camera nearest to its mean. Sorted.
 ///
 /// # Errors
-/// [`CameraError::Selection`] where the candidates have fewer than `count` distinct centres.
+/// [`CameraError::Selection`] where the candidates have fewer than `count` distinct centers.
 pub fn inputs_around(
     centers: &[DVec3],
     candidates: &[usize],
@@ -180,7 +180,7 @@ pub fn inputs_around(
     for cluster in 0..count {
         let own: Vec<usize> = candidates.iter().zip(&labels).filter(|(_, l)| **l == cluster).map(|(&i, _)| i).collect();
         if own.is_empty() {
-            return refuse("some with the same centre".into());
+            return refuse("some with the same center".into());
         }
         chosen.push(nearest_to_mean(centers, &own));
     }
@@ -189,7 +189,7 @@ pub fn inputs_around(
 }
 
 /// `count` inputs among `candidates` from the side that the views `side` see: the cameras nearest to the mean of the
-/// centres of `side`, none of them farther from it than the farthest of `side`. Sorted; for fewer inputs, a part of those for
+/// centers of `side`, none of them farther from it than the farthest of `side`. Sorted; for fewer inputs, a part of those for
 /// more.
 ///
 /// # Errors

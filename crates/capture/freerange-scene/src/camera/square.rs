@@ -57,8 +57,8 @@ impl Window {
         }
         // No wider than the image: what it does not show is not known to be empty.
         let half = (0.5 * across / FILL).min(0.5 * short as f64);
-        let along = |focal: f64, centre: f64, at: f64, size: u32| {
-            let middle = (focal * at / middle.z + centre).clamp(half, f64::from(size) - half);
+        let along = |focal: f64, center: f64, at: f64, size: u32| {
+            let middle = (focal * at / middle.z + center).clamp(half, f64::from(size) - half);
             let low = (middle - half).floor() as i64;
             (low, low + (2.0 * half).ceil() as i64)
         };

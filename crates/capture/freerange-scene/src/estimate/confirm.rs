@@ -25,9 +25,9 @@ pub fn confirmed(views: &[View], hints: &Hints) -> Option<Vec<Option<Vec<u8>>>> 
     }
     let pictures: Vec<Picture> = views.par_iter().map(|v| Picture::of(v, SMALL)).collect();
     let masks: Vec<Vec<bool>> = pictures.iter().map(|p| p.valid.clone()).collect();
-    let centre = hints.center.or_else(|| meeting_point(views))?;
-    let radius = expected_radius(&pictures, centre, hints)?;
-    let hull = Hull::carve(&pictures, &masks, centre, 1.3 * radius, None, (views.len() / MISSING).max(1), FINE)?;
+    let center = hints.center.or_else(|| meeting_point(views))?;
+    let radius = expected_radius(&pictures, center, hints)?;
+    let hull = Hull::carve(&pictures, &masks, center, 1.3 * radius, None, (views.len() / MISSING).max(1), FINE)?;
     let keep = views.par_iter().zip(&pictures).zip(&masks).map(|((view, picture), mask)| {
         let (w, h) = (picture.width(), picture.height());
         let there = grown(&hull.outline(picture), w, h, MARGIN);

@@ -12,7 +12,7 @@ use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use std::collections::HashSet;
 
-/// Colour differences beyond this count as this (Lab).
+/// Color differences beyond this count as this (Lab).
 const CAP: f32 = 30.0;
 /// Points of the hull's surface that are looked at, at most.
 const POINTS: usize = 3000;
@@ -84,7 +84,7 @@ pub fn gather(
     pictures: &[Picture],
     masks: &[Vec<bool>],
     hull: Option<&Hull>,
-    centre: DVec3,
+    center: DVec3,
     radius: f64,
     plane: Option<&Plane>,
     distance: f64,
@@ -103,18 +103,18 @@ pub fn gather(
         let seen = |i: usize, x: f64, y: f64| {
             let j = (i + shift) % count;
             let (u, v) = handed(&pictures[i], &pictures[j], x, y);
-            at(&pictures[j], u, v).filter(|k| masks[j][*k]).map(|_| colour(&pictures[j], u, v))
+            at(&pictures[j], u, v).filter(|k| masks[j][*k]).map(|_| color(&pictures[j], u, v))
         };
         differ(points.iter().map(|views| views.iter().filter_map(|(i, x, y)| seen(*i, *x, *y)).collect()), 2)
     };
     let on_table = |shift: usize| {
-        let spots = plane.map(|plane| spots(centre, plane, 0.7 * distance)).unwrap_or_default();
+        let spots = plane.map(|plane| spots(center, plane, 0.7 * distance)).unwrap_or_default();
         let seen = |i: usize, point: DVec3| {
             let (x, y, z) = pictures[i].project(point);
             at(&pictures[i], x, y).filter(|_| z > 0.0)?;
             let j = (i + shift) % count;
             let (u, v) = handed(&pictures[i], &pictures[j], x, y);
-            at(&pictures[j], u, v).filter(|k| !masks[j][*k]).map(|_| colour(&pictures[j], u, v))
+            at(&pictures[j], u, v).filter(|k| !masks[j][*k]).map(|_| color(&pictures[j], u, v))
         };
         differ(spots.iter().map(|p| (0..count).filter_map(|i| seen(i, *p)).collect()), 3)
     };
@@ -122,7 +122,7 @@ pub fn gather(
         let given: Vec<Vec<bool>> = (0..count)
             .map(|i| moved(&pictures[i], &pictures[(i + shift) % count], &masks[(i + shift) % count]))
             .collect();
-        Some(mean(&outside(pictures, &given, centre, radius)))
+        Some(mean(&outside(pictures, &given, center, radius)))
     };
     Evidence { surface: compared(&on_surface), table: compared(&on_table), outline: compared(&outlines) }
 }
@@ -132,8 +132,8 @@ fn mean(values: &[f64]) -> f64 {
 }
 
 /// For each view: the share of its mask that the hull of the other masks does not cover.
-pub fn outside(pictures: &[Picture], masks: &[Vec<bool>], centre: DVec3, radius: f64) -> Vec<f64> {
-    let nearly = Nearly::carve(pictures, masks, centre, radius, GRID);
+pub fn outside(pictures: &[Picture], masks: &[Vec<bool>], center: DVec3, radius: f64) -> Vec<f64> {
+    let nearly = Nearly::carve(pictures, masks, center, radius, GRID);
     (0..pictures.len()).map(|i| left_out(&masks[i], &nearly.without(&[i]).outline(&pictures[i]))).collect()
 }
 
@@ -145,9 +145,9 @@ fn left_out(mask: &[bool], outline: &[bool]) -> f64 {
 
 /// For each view, how far its mask and those of the others contradict each other, 0 to 1: the share of it that the hull of the others
 /// does not cover, or the share of the others' masks, on average, that no hull covers because of it; the larger of both.
-pub fn contradictions(pictures: &[Picture], masks: &[Vec<bool>], centre: DVec3, radius: f64) -> Vec<f64> {
+pub fn contradictions(pictures: &[Picture], masks: &[Vec<bool>], center: DVec3, radius: f64) -> Vec<f64> {
     let count = pictures.len();
-    let nearly = Nearly::carve(pictures, masks, centre, radius, GRID);
+    let nearly = Nearly::carve(pictures, masks, center, radius, GRID);
     let share = |of: usize, without: &[usize]| left_out(&masks[of], &nearly.without(without).outline(&pictures[of]));
     let own: Vec<f64> = (0..count).into_par_iter().map(|i| share(i, &[i])).collect();
     (0..count)
@@ -186,7 +186,7 @@ fn at(picture: &Picture, x: f64, y: f64) -> Option<usize> {
     picture.valid[k].then_some(k)
 }
 
-fn colour(picture: &Picture, x: f64, y: f64) -> Vec3 {
+fn color(picture: &Picture, x: f64, y: f64) -> Vec3 {
     bilinear(&picture.smooth, picture.width(), picture.height(), x, y)
 }
 
@@ -236,30 +236,30 @@ fn depth(points: &[DVec3], step: f64, picture: &Picture) -> Vec<f32> {
 }
 
 /// Points of a disc of the table.
-fn spots(centre: DVec3, plane: &Plane, radius: f64) -> Vec<DVec3> {
+fn spots(center: DVec3, plane: &Plane, radius: f64) -> Vec<DVec3> {
     let (a, b) = across(plane.normal);
-    let origin = centre + plane.height * plane.normal;
+    let origin = center + plane.height * plane.normal;
     let at = |k: usize| (2.0 * (k as f64 + 0.5) / TABLE as f64 - 1.0) * radius;
     let all = (0..TABLE * TABLE).map(|i| (at(i % TABLE), at(i / TABLE)));
     all.filter(|(x, y)| x.hypot(*y) <= radius).map(|(x, y)| origin + x * a + y * b).collect()
 }
 
-/// How far the colours of a point differ from their median, on average over points with `least` colours or more; none where these are
+/// How far the colors of a point differ from their median, on average over points with `least` colors or more; none where these are
 /// few.
 fn differ(points: impl Iterator<Item = Vec<Vec3>>, least: usize) -> Option<f64> {
     let (mut sum, mut count) = (0.0, 0usize);
     let mut channel: Vec<f32> = Vec::new();
-    for colours in points.filter(|c| c.len() >= least) {
+    for colors in points.filter(|c| c.len() >= least) {
         let mut median = Vec3::ZERO;
         for c in 0..3 {
             channel.clear();
-            channel.extend(colours.iter().map(|v| v[c]));
+            channel.extend(colors.iter().map(|v| v[c]));
             channel.sort_by(f32::total_cmp);
             let n = channel.len();
             median[c] = 0.5 * (channel[(n - 1) / 2] + channel[n / 2]);
         }
-        sum += colours.iter().map(|v| f64::from((*v - median).abs().max_element().min(CAP))).sum::<f64>();
-        count += colours.len();
+        sum += colors.iter().map(|v| f64::from((*v - median).abs().max_element().min(CAP))).sum::<f64>();
+        count += colors.len();
     }
     (count >= 100).then(|| sum / count as f64)
 }

@@ -79,7 +79,7 @@ pub struct Nearly {
 
 impl Nearly {
     /// Looks through the sphere. `grid`: points along its diameter.
-    pub fn carve(pictures: &[Picture], masks: &[Vec<bool>], centre: DVec3, radius: f64, grid: usize) -> Self {
+    pub fn carve(pictures: &[Picture], masks: &[Vec<bool>], center: DVec3, radius: f64, grid: usize) -> Self {
         let views = Outside::new(pictures, masks);
         let step = 2.0 * radius / grid as f64;
         let at = |i: usize| (i as f64 + 0.5) * step - radius;
@@ -91,14 +91,14 @@ impl Nearly {
             .filter_map(|p| {
                 let mut without = [None; 2];
                 let mut count = 0;
-                let shown = views.each(centre + p, 0.5 * step, |i| {
+                let shown = views.each(center + p, 0.5 * step, |i| {
                     if count < 2 {
                         without[count] = Some(i);
                     }
                     count += 1;
                     count <= 2
                 })?;
-                (shown >= count + 2).then_some((centre + p, without))
+                (shown >= count + 2).then_some((center + p, without))
             })
             .collect();
         Self { points, step }
@@ -120,17 +120,17 @@ pub struct Hull {
     pub step: f64,
 }
 
-/// The region below `centre + height normal` that cannot be the object: the table.
+/// The region below `center + height normal` that cannot be the object: the table.
 pub type Floor = Option<(DVec3, f64)>;
 
 impl Hull {
-    /// Carves the sphere about `centre`. A point belongs to the hull if all views but `missing` have it in their mask, within half a
+    /// Carves the sphere about `center`. A point belongs to the hull if all views but `missing` have it in their mask, within half a
     /// voxel and half a pixel; a view whose mask reaches its border says nothing of what lies beyond. At least two views must tell. None
     /// where no point does. `grid`: voxels along the longest side.
     pub fn carve(
         pictures: &[Picture],
         masks: &[Vec<bool>],
-        centre: DVec3,
+        center: DVec3,
         radius: f64,
         floor: Floor,
         missing: usize,
@@ -138,7 +138,7 @@ impl Hull {
     ) -> Option<Self> {
         let views = Outside::new(pictures, masks);
         let within = |point: DVec3, half: f64| {
-            if floor.is_some_and(|(normal, height)| (point - centre).dot(normal) < height - half) {
+            if floor.is_some_and(|(normal, height)| (point - center).dot(normal) < height - half) {
                 return false;
             }
             let mut out = 0;
@@ -148,8 +148,8 @@ impl Hull {
             });
             shown.is_some_and(|shown| shown >= 2)
         };
-        let (low, high) = (centre - DVec3::splat(radius), centre + DVec3::splat(radius));
-        let coarse = Self::sample(low, high, COARSE, |p, half| p.distance(centre) <= radius && within(p, half))?;
+        let (low, high) = (center - DVec3::splat(radius), center + DVec3::splat(radius));
+        let coarse = Self::sample(low, high, COARSE, |p, half| p.distance(center) <= radius && within(p, half))?;
         let (low, high) = coarse.bounds();
         Self::sample(low, high, grid, within)
     }

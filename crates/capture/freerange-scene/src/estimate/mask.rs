@@ -4,7 +4,7 @@ use super::picture::{Picture, bilinear};
 
 /// Parts of a mask, beside its largest, of which less than this share lies within the hull are something else that stands there.
 const WITHIN: f32 = 0.5;
-/// Holes whose mean log odds are less stay open: handles have them. Others are print in the background's colour.
+/// Holes whose mean log odds are less stay open: handles have them. Others are print in the background's color.
 const OPEN: f32 = -1.0;
 
 /// Fills holes that are not background, and drops parts that are small beside the largest or that lie outside of `outline`, where the hull
@@ -30,7 +30,7 @@ pub fn tidy(mask: &[bool], odds: &[f32], outline: Option<&[bool]>, picture: &Pic
     out
 }
 
-/// Connected pixels (four neighbours) with this value.
+/// Connected pixels (four neighbors) with this value.
 fn parts(mask: &[bool], value: bool, w: usize, h: usize) -> Vec<Vec<usize>> {
     let mut seen = vec![false; mask.len()];
     let mut parts = Vec::new();

@@ -1,11 +1,11 @@
-//! The least cut of a picture in two: a maximum flow on the grid of its pixels, each joined to its eight neighbours.
+//! The least cut of a picture in two: a maximum flow on the grid of its pixels, each joined to its eight neighbors.
 //!
 //! Boykov and Kolmogorov 2004: two search trees grow from source and sink until they touch, the path between them is filled, and what
 //! loses its parent by that looks for another one. Whole numbers, so that nothing depends on rounding.
 
 use std::collections::VecDeque;
 
-/// Right, left, down, up, and the diagonals; opposite directions are neighbours in this list.
+/// Right, left, down, up, and the diagonals; opposite directions are neighbors in this list.
 const STEPS: [(i32, i32); 8] = [(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (-1, 1), (1, -1)];
 /// Parents beside the eight directions.
 const TERMINAL: u8 = 8;
@@ -19,7 +19,7 @@ const SINK: u8 = 2;
 /// The graph of one picture.
 pub struct Grid {
     width: usize,
-    /// Row length with one empty node at each end, so that every node has eight neighbours.
+    /// Row length with one empty node at each end, so that every node has eight neighbors.
     stride: usize,
     height: usize,
     offsets: [isize; 8],
@@ -70,7 +70,7 @@ impl Grid {
         self.terminal[node] = cost;
     }
 
-    /// What it costs to part a pixel from its right (0), lower (1), lower right (2) or lower left (3) neighbour. A neighbour outside
+    /// What it costs to part a pixel from its right (0), lower (1), lower right (2) or lower left (3) neighbor. A neighbor outside
     /// of the picture is ignored.
     pub fn set_edge(&mut self, x: usize, y: usize, which: usize, cost: i32) {
         let direction = 2 * which;
@@ -95,7 +95,7 @@ impl Grid {
         }
     }
 
-    /// What can still flow between `node` and its neighbour `other` (in `direction`) in the sense of `node`'s tree: away from the
+    /// What can still flow between `node` and its neighbor `other` (in `direction`) in the sense of `node`'s tree: away from the
     /// source, towards the sink.
     fn outwards(&self, node: usize, other: usize, direction: usize) -> i32 {
         match self.tree[node] {
@@ -138,7 +138,7 @@ impl Grid {
         side
     }
 
-    /// Lets a node take its free neighbours in; the direction in which it touches the other tree, if it does.
+    /// Lets a node take its free neighbors in; the direction in which it touches the other tree, if it does.
     fn grow(&mut self, node: usize) -> Option<usize> {
         let own = self.tree[node];
         if own == FREE {

@@ -1,4 +1,4 @@
-//! Masks mended with what the other views show: a quick fit of all the others says where the object is in a view, and in which colour.
+//! Masks mended with what the other views show: a quick fit of all the others says where the object is in a view, and in which color.
 
 use super::mask::{enlarged, smooth};
 use super::odds::odds;
@@ -17,7 +17,7 @@ pub(super) const LEAST_TO_MEND: usize = 5;
 /// Log odds against what lies outside of the hull, beside what the other views show.
 pub(super) const OUTSIDE_MENDING: f32 = 1.0;
 
-/// Shows each view as all the others have it, by whatever makes a shape of views: straight colour and alpha, in the order and size of the
+/// Shows each view as all the others have it, by whatever makes a shape of views: straight color and alpha, in the order and size of the
 /// views, whose alpha is the masks as they are so far. Or says why not.
 pub type OthersShow = fn(&[View]) -> Result<Vec<RgbaImage>, String>;
 
@@ -53,16 +53,16 @@ impl Stage {
         let near: Vec<Vec<f32>> = (0..count).map(|i| self.nearness(i)).collect();
         let background = self.background(&last.masks);
         let tables: Vec<Option<Table>> = (0..count).map(|i| self.table(&background, i)).collect();
-        let (object, behind) = self.colours(&near, &tables, Some(last))?;
+        let (object, behind) = self.colors(&near, &tables, Some(last))?;
         let shown: Vec<[Shown; 2]> = (0..count)
             .map(|i| {
                 let picture = &self.pictures[i];
                 let small = resize_area(&shown[i], picture.camera.width, picture.camera.height);
                 let mut small = Shown::of(&small, 0.0);
                 let sure = (0..small.alpha.len()).filter(|k| small.alpha[*k] > 0.9 && last.masks[i][*k]);
-                let mut off: Vec<f32> = sure.map(|k| picture.smooth[k].distance(small.colour[k])).collect();
+                let mut off: Vec<f32> = sure.map(|k| picture.smooth[k].distance(small.color[k])).collect();
                 off.sort_by(f32::total_cmp);
-                // Where they show nothing, any colour may be expected.
+                // Where they show nothing, any color may be expected.
                 small.scale = 2.0 + 1.5 * off.get(off.len() / 2).copied().unwrap_or(20.0);
                 let large = Shown::of(&shown[i], small.scale);
                 [small, large]

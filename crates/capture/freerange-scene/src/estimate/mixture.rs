@@ -1,11 +1,11 @@
-//! Mixtures of Gaussians over colours, fitted by expectation and maximisation.
+//! Mixtures of Gaussians over colors, fitted by expectation and maximization.
 
 use glam::{Mat3, Vec3};
 use rand::{Rng, SeedableRng, seq::IndexedRandom};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
-/// Added to every variance: colours are whole numbers, and few samples must not make a spike.
+/// Added to every variance: colors are whole numbers, and few samples must not make a spike.
 const FLOOR: f32 = 2.0;
 /// Samples that a fit looks at, at most.
 const SAMPLES: usize = 6000;
@@ -14,39 +14,39 @@ const ROUNDS: usize = 20;
 struct Component {
     mean: Vec3,
     inverse: Mat3,
-    /// Logarithm of weight and normalisation.
+    /// Logarithm of weight and normalization.
     log_scale: f32,
 }
 
-/// A density over Lab colours.
+/// A density over Lab colors.
 pub struct Mixture(Vec<Component>);
 
 impl Mixture {
-    /// Fits `count` components to the colours; none for no colours. The same colours and seed give the same mixture.
-    pub fn fit(colours: &[Vec3], count: usize, seed: u64) -> Option<Self> {
+    /// Fits `count` components to the colors; none for no colors. The same colors and seed give the same mixture.
+    pub fn fit(colors: &[Vec3], count: usize, seed: u64) -> Option<Self> {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let samples: Vec<Vec3> = match colours.len() {
+        let samples: Vec<Vec3> = match colors.len() {
             0 => return None,
-            n if n <= SAMPLES => colours.to_vec(),
-            _ => colours.choose_multiple(&mut rng, SAMPLES).copied().collect(),
+            n if n <= SAMPLES => colors.to_vec(),
+            _ => colors.choose_multiple(&mut rng, SAMPLES).copied().collect(),
         };
-        let mut centres = vec![samples[rng.random_range(0..samples.len())]];
+        let mut centers = vec![samples[rng.random_range(0..samples.len())]];
         let mut nearest = vec![f32::INFINITY; samples.len()];
-        while centres.len() < count {
-            let last = centres[centres.len() - 1];
+        while centers.len() < count {
+            let last = centers[centers.len() - 1];
             nearest.iter_mut().zip(&samples).for_each(|(d, s)| *d = d.min(s.distance_squared(last)));
             let mut left = rng.random::<f32>() * nearest.iter().sum::<f32>();
             let chosen = nearest.iter().position(|d| {
                 left -= d;
                 left < 0.0
             });
-            centres.push(samples[chosen.unwrap_or(samples.len() - 1)]);
+            centers.push(samples[chosen.unwrap_or(samples.len() - 1)]);
         }
         // Shares of the components in each sample; first all to the nearest.
         let mut shares: Vec<Vec<f32>> = samples
             .iter()
             .map(|s| {
-                let distance = |c: &usize| s.distance_squared(centres[*c]);
+                let distance = |c: &usize| s.distance_squared(centers[*c]);
                 let own = (0..count).min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap_or(0);
                 (0..count).map(|c| f32::from(u8::from(c == own))).collect()
             })
@@ -79,25 +79,25 @@ impl Mixture {
         Self(components.collect())
     }
 
-    fn logs(&self, colour: Vec3) -> impl Iterator<Item = f32> {
+    fn logs(&self, color: Vec3) -> impl Iterator<Item = f32> {
         self.0.iter().map(move |c| {
-            let d = colour - c.mean;
+            let d = color - c.mean;
             c.log_scale - 0.5 * d.dot(c.inverse * d)
         })
     }
 
-    fn shares(&self, colour: Vec3) -> Vec<f32> {
-        let most = self.logs(colour).fold(f32::NEG_INFINITY, f32::max);
-        let mut shares: Vec<f32> = self.logs(colour).map(|l| (l - most).exp()).collect();
+    fn shares(&self, color: Vec3) -> Vec<f32> {
+        let most = self.logs(color).fold(f32::NEG_INFINITY, f32::max);
+        let mut shares: Vec<f32> = self.logs(color).map(|l| (l - most).exp()).collect();
         let sum: f32 = shares.iter().sum();
         shares.iter_mut().for_each(|s| *s /= sum);
         shares
     }
 
-    /// Logarithm of the density at a colour.
-    pub fn log_density(&self, colour: Vec3) -> f32 {
-        let most = self.logs(colour).fold(f32::NEG_INFINITY, f32::max);
-        most + self.logs(colour).map(|l| (l - most).exp()).sum::<f32>().ln()
+    /// Logarithm of the density at a color.
+    pub fn log_density(&self, color: Vec3) -> f32 {
+        let most = self.logs(color).fold(f32::NEG_INFINITY, f32::max);
+        most + self.logs(color).map(|l| (l - most).exp()).sum::<f32>().ln()
     }
 }
 
@@ -108,9 +108,9 @@ mod tests {
     #[test]
     fn two_heaps_are_found() {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
-        let mut heap = |centre: Vec3, spread: f32, count: usize| -> Vec<Vec3> {
+        let mut heap = |center: Vec3, spread: f32, count: usize| -> Vec<Vec3> {
             let mut noise = || (0..12).map(|_| rng.random::<f32>()).sum::<f32>() - 6.0;
-            (0..count).map(|_| centre + spread * Vec3::new(noise(), noise(), noise())).collect()
+            (0..count).map(|_| center + spread * Vec3::new(noise(), noise(), noise())).collect()
         };
         let (a, b) = (Vec3::new(20.0, 5.0, -3.0), Vec3::new(80.0, -20.0, 30.0));
         let samples = [heap(a, 3.0, 3000), heap(b, 6.0, 1000)].concat();
@@ -121,7 +121,7 @@ mod tests {
         assert!((mixture.log_density(b) - log(0.25, 36.0)).abs() < 0.2);
         assert!(mixture.log_density(Vec3::new(50.0, 0.0, 100.0)) < -30.0);
         assert!(Mixture::fit(&[], 3, 0).is_none());
-        // Fewer colours than components.
+        // Fewer colors than components.
         assert!(Mixture::fit(&[a; 3], 5, 0).unwrap().log_density(a).is_finite());
     }
 }

@@ -1,11 +1,11 @@
-//! Masks from poses and colours alone.
+//! Masks from poses and colors alone.
 //!
 //! What is used, in short: the cameras look at the object, so that their axes meet in it (Campbell et al. 2010); what lies at the borders
 //! of the photos is not the object; objects stand on something flat, whose look is known from the views that see past the object
-//! (`plane`); colours of object and background are mixtures of Gaussians, common to all views, and each view is cut at least cost
+//! (`plane`); colors of object and background are mixtures of Gaussians, common to all views, and each view is cut at least cost
 //! (GrabCut, Rother et al. 2004); what no other view confirms is not the object (`hull`). These take turns until nothing changes. Then,
 //! where there is something that makes Gaussians of views ([`OthersShow`]), each mask is mended with what all the others make of its view:
-//! print in the table's colour, a foot in its own shadow, the opening of a handle. Work is done on small pictures, and only the outline is
+//! print in the table's color, a foot in its own shadow, the opening of a handle. Work is done on small pictures, and only the outline is
 //! cut again on larger ones.
 
 mod confirm;
@@ -53,10 +53,10 @@ const OUTSIDE: f32 = 5.0;
 /// Log odds for what lies within it.
 const INSIDE: f32 = 1.0;
 /// How far from where the cameras look, in radii of the sphere about it, the table is not believed before there are masks, and from where it
-/// is. Less, and the foot of what has one colour is taken for a print on the table, on which all views agree.
+/// is. Less, and the foot of what has one color is taken for a print on the table, on which all views agree.
 const UNSEEN: f32 = 0.7;
 const SEEN: f32 = 0.95;
-/// Before there are masks, colours that are certainly the object's stand for all of it if they are this share of what lies about where the
+/// Before there are masks, colors that are certainly the object's stand for all of it if they are this share of what lies about where the
 /// cameras look. A handle that stands out is less: what it belongs to may lie flat on the table.
 const SURE: f64 = 0.02;
 /// Voxels along the hull's longest side: while masks change, and to judge them.
@@ -84,7 +84,7 @@ pub struct Estimate {
     pub alpha: Vec<Vec<u8>>,
     /// For every view: how far its mask agrees with the hull of all masks (intersection over union).
     pub agreement: Vec<f64>,
-    /// For every view: the share of pixels about the object whose own colour speaks for the side that they were put on.
+    /// For every view: the share of pixels about the object whose own color speaks for the side that they were put on.
     pub clearness: Vec<f64>,
     /// The direction in which the plane that the object stands on faces, where one was found.
     pub up: Option<DVec3>,
@@ -144,7 +144,7 @@ pub fn unjudged(views: &[View], hints: &Hints) -> Result<Estimate, SceneError> {
             "the object stands on a plane that faces ({:.3}, {:.3}, {:.3})",
             plane.normal.x, plane.normal.y, plane.normal.z
         )),
-        None => notes.push("no plane beneath the object stands out: masks rest on colours and outlines alone".into()),
+        None => notes.push("no plane beneath the object stands out: masks rest on colors and outlines alone".into()),
     }
     let mut small = stage.take_turns()?;
     // Poses are judged by what photos say themselves.
@@ -161,7 +161,7 @@ pub fn unjudged(views: &[View], hints: &Hints) -> Result<Estimate, SceneError> {
         }
     }
     let large = stage.sharpen(views, &small)?;
-    let hull = Hull::carve(&large.pictures, &large.masks, stage.centre, 1.3 * stage.radius, stage.floor(), 0, FINE);
+    let hull = Hull::carve(&large.pictures, &large.masks, stage.center, 1.3 * stage.radius, stage.floor(), 0, FINE);
     let agreement: Vec<f64> = match &hull {
         Some(hull) => large.pictures.iter().zip(&large.masks).map(|(p, m)| overlap(&hull.outline(p), m)).collect(),
         None => vec![0.0; views.len()],
@@ -185,7 +185,7 @@ pub fn unjudged(views: &[View], hints: &Hints) -> Result<Estimate, SceneError> {
 struct Stage {
     pictures: Vec<Picture>,
     /// Where the cameras look, and the sphere about it that the object is expected in.
-    centre: DVec3,
+    center: DVec3,
     radius: f64,
     /// Mean distance of the cameras.
     distance: f64,
@@ -216,20 +216,20 @@ struct Sharp {
 impl Stage {
     fn new(views: &[View], hints: &Hints) -> Result<Self, SceneError> {
         let pictures: Vec<Picture> = views.par_iter().map(|v| Picture::of(v, SMALL)).collect();
-        let Some(centre) = hints.center.or_else(|| meeting_point(views)) else {
+        let Some(center) = hints.center.or_else(|| meeting_point(views)) else {
             let reason = "the cameras do not look at one common point; if the poses are right, say where the object is (--center X,Y,Z)";
             return Err(SceneError::NotCutOut { reason: reason.into() });
         };
-        let distance = views.iter().map(|v| v.camera.center().distance(centre)).sum::<f64>() / views.len() as f64;
-        let Some(radius) = expected_radius(&pictures, centre, hints) else {
+        let distance = views.iter().map(|v| v.camera.center().distance(center)).sum::<f64>() / views.len() as f64;
+        let Some(radius) = expected_radius(&pictures, center, hints) else {
             let reason =
                 "the point that the cameras look at is not in the photos; say where the object is (--center X,Y,Z)";
             return Err(SceneError::NotCutOut { reason: reason.into() });
         };
-        let mut stage = Self { pictures, centre, radius, distance, plane: None, best: None };
+        let mut stage = Self { pictures, center, radius, distance, plane: None, best: None };
         let object: Vec<Vec<bool>> =
             (0..views.len()).map(|i| stage.nearness(i).iter().map(|d| *d < 0.6).collect()).collect();
-        let found = plane::find(&stage.pictures, &object, centre, mean_up(views), distance);
+        let found = plane::find(&stage.pictures, &object, center, mean_up(views), distance);
         stage.plane = found.filter(|(_, stands_out)| *stands_out).map(|(plane, _)| plane);
         stage.best = found.map(|(plane, _)| plane);
         Ok(stage)
@@ -238,23 +238,23 @@ impl Stage {
     fn evidence(&self, found: &Masks) -> Evidence {
         let reach = 1.3 * self.radius;
         let missing = usize::from(self.pictures.len() >= 6);
-        let hull = Hull::carve(&self.pictures, &found.masks, self.centre, reach, self.floor(), missing, 2 * ROUGH);
+        let hull = Hull::carve(&self.pictures, &found.masks, self.center, reach, self.floor(), missing, 2 * ROUGH);
         let (masks, plane) = (&found.masks, self.best.as_ref());
-        evidence::gather(&self.pictures, masks, hull.as_ref(), self.centre, reach, plane, self.distance)
+        evidence::gather(&self.pictures, masks, hull.as_ref(), self.center, reach, plane, self.distance)
     }
 
     fn floor(&self) -> Floor {
         self.plane.as_ref().map(|p| (p.normal, p.height))
     }
 
-    /// How far each pixel's ray passes by the centre, in radii: `[h, w]`.
+    /// How far each pixel's ray passes by the center, in radii: `[h, w]`.
     fn nearness(&self, i: usize) -> Vec<f32> {
-        nearness(&self.pictures[i], self.centre, self.radius)
+        nearness(&self.pictures[i], self.center, self.radius)
     }
 
     fn table(&self, background: &[Vec<f32>], i: usize) -> Option<Table> {
         let plane = self.plane.as_ref()?;
-        Some(plane::table(&self.pictures, background, i, self.centre, plane, self.distance, |_| true))
+        Some(plane::table(&self.pictures, background, i, self.center, plane, self.distance, |_| true))
     }
 
     /// Cuts all views in turns until their masks stay as they are.
@@ -266,7 +266,7 @@ impl Stage {
         let mut last: Option<Masks> = None;
         for _ in 0..TURNS {
             let tables: Vec<Option<Table>> = (0..count).map(|i| self.table(&background, i)).collect();
-            let (object, behind) = self.colours(&near, &tables, last.as_ref())?;
+            let (object, behind) = self.colors(&near, &tables, last.as_ref())?;
             let cut: Vec<(Vec<bool>, f64)> = (0..count)
                 .into_par_iter()
                 .map(|i| {
@@ -302,7 +302,7 @@ impl Stage {
         last.ok_or_else(|| SceneError::NotCutOut { reason: "no turns".into() })
     }
 
-    /// The small picture `i` cut at these log odds, tidied by what colours alone and the hull's outline say.
+    /// The small picture `i` cut at these log odds, tidied by what colors alone and the hull's outline say.
     fn cut(
         &self,
         i: usize,
@@ -320,7 +320,7 @@ impl Stage {
     /// Where the hull of small masks appears in each picture, and a little around it.
     fn outlines(&self, masks: &[Vec<bool>]) -> Option<Vec<Vec<bool>>> {
         let missing = usize::from(masks.len() >= 6);
-        let hull = Hull::carve(&self.pictures, masks, self.centre, 1.3 * self.radius, self.floor(), missing, ROUGH)?;
+        let hull = Hull::carve(&self.pictures, masks, self.center, 1.3 * self.radius, self.floor(), missing, ROUGH)?;
         Some(self.pictures.par_iter().map(|p| grown(&hull.outline(p), p.width(), p.height(), 2)).collect())
     }
 
@@ -332,8 +332,8 @@ impl Stage {
         masks.iter().zip(&self.pictures).map(of).collect()
     }
 
-    /// Colours of the object and of the rest, from the last masks or from where the cameras look.
-    fn colours(
+    /// Colors of the object and of the rest, from the last masks or from where the cameras look.
+    fn colors(
         &self,
         near: &[Vec<f32>],
         tables: &[Option<Table>],
@@ -341,28 +341,28 @@ impl Stage {
     ) -> Result<(Mixture, Mixture), SceneError> {
         let (mut object, mut sure, mut rest, mut below) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
         for (i, picture) in self.pictures.iter().enumerate() {
-            for (k, colour) in picture.lab.iter().enumerate().filter(|(k, _)| picture.valid[*k]) {
+            for (k, color) in picture.lab.iter().enumerate().filter(|(k, _)| picture.valid[*k]) {
                 let (inside, outside) = match last {
                     Some(last) => (last.masks[i][k], !last.masks[i][k]),
                     None => (near[i][k] < 0.55, near[i][k] > 0.95),
                 };
                 if outside {
-                    rest.push(*colour);
+                    rest.push(*color);
                 }
                 if inside {
-                    object.push(*colour);
+                    object.push(*color);
                 }
                 if let Some(table) = &tables[i] {
-                    // Not what the table looks like there: no shadow, whatever its colour.
+                    // Not what the table looks like there: no shadow, whatever its color.
                     let least = if last.is_some() { 2.0 } else { 4.0 };
                     if inside
                         && table.trust[k] > 0.3
-                        && picture.smooth[k].distance(table.colour[k]) > least * table.scale[k]
+                        && picture.smooth[k].distance(table.color[k]) > least * table.scale[k]
                     {
-                        sure.push(*colour);
+                        sure.push(*color);
                     }
                     if near[i][k] < 1.0 && table.trust[k] > 0.8 && table.scale[k] < 10.0 {
-                        below.push(table.colour[k]);
+                        below.push(table.color[k]);
                     }
                 }
             }
@@ -406,7 +406,7 @@ impl Stage {
                 let table = self
                     .plane
                     .as_ref()
-                    .map(|plane| plane::table(&pictures, &background, i, self.centre, plane, self.distance, open));
+                    .map(|plane| plane::table(&pictures, &background, i, self.center, plane, self.distance, open));
                 let shown = small.shown.get(i).map(|[_, large]| large);
                 let odds = odds(picture, &small.object, &small.background, table.as_ref(), shown, open);
                 let outline: Vec<f32> = small.outlines[i].iter().map(|m| f32::from(u8::from(*m))).collect();
@@ -429,9 +429,9 @@ impl Stage {
     }
 }
 
-/// Every so manyth colour, so that about `count` are left.
-fn thinned(colours: &[Vec3], count: usize) -> Vec<Vec3> {
-    colours.iter().step_by((colours.len() / count).max(1)).copied().collect()
+/// Every so manyth color, so that about `count` are left.
+fn thinned(colors: &[Vec3], count: usize) -> Vec<Vec3> {
+    colors.iter().step_by((colors.len() / count).max(1)).copied().collect()
 }
 
 /// Whether masks at full size reach the border of their views.
@@ -441,11 +441,11 @@ pub(crate) fn cut_off(alpha: &[u8], w: u32, h: u32) -> bool {
 }
 
 /// How far masks (the views' alpha) agree with their common hull, for each view: intersection over union. The hull is looked for in the
-/// sphere of this `radius` about `centre`.
-pub fn agreement(views: &[View], centre: DVec3, radius: f64) -> Vec<f64> {
+/// sphere of this `radius` about `center`.
+pub fn agreement(views: &[View], center: DVec3, radius: f64) -> Vec<f64> {
     let pictures: Vec<Picture> = views.par_iter().map(|v| Picture::of(v, SMALL)).collect();
     let masks: Vec<Vec<bool>> = pictures.iter().map(|p| p.valid.clone()).collect();
-    match Hull::carve(&pictures, &masks, centre, radius, None, 0, FINE) {
+    match Hull::carve(&pictures, &masks, center, radius, None, 0, FINE) {
         Some(hull) => pictures.iter().zip(&masks).map(|(p, m)| overlap(&hull.outline(p), m)).collect(),
         None => vec![0.0; views.len()],
     }
@@ -453,17 +453,17 @@ pub fn agreement(views: &[View], centre: DVec3, radius: f64) -> Vec<f64> {
 
 /// How far each mask (the views' alpha) and those of the others contradict each other, 0 to 1: the share of it that lies outside of the
 /// others' hull, or the share of the others that it alone keeps out of the hull, on average; the larger of both. For three views or more.
-pub fn contradictions(views: &[View], centre: DVec3, radius: f64) -> Vec<f64> {
+pub fn contradictions(views: &[View], center: DVec3, radius: f64) -> Vec<f64> {
     let pictures: Vec<Picture> = views.par_iter().map(|v| Picture::of(v, SMALL)).collect();
     let masks: Vec<Vec<bool>> = pictures.iter().map(|p| p.valid.clone()).collect();
-    evidence::contradictions(&pictures, &masks, centre, radius)
+    evidence::contradictions(&pictures, &masks, center, radius)
 }
 
 /// The direction in which the plane faces that the object stands on, where one stands out. `views`: the object cut out; `whole`: the
 /// photos with what is around it, in the same order.
 pub fn table_faces(views: &[View], whole: &[RgbaImage]) -> Option<DVec3> {
-    let centre = meeting_point(views).filter(|_| views.len() >= 3)?;
-    let distance = views.iter().map(|v| v.camera.center().distance(centre)).sum::<f64>() / views.len() as f64;
+    let center = meeting_point(views).filter(|_| views.len() >= 3)?;
+    let distance = views.iter().map(|v| v.camera.center().distance(center)).sum::<f64>() / views.len() as f64;
     let object: Vec<Vec<bool>> = views
         .par_iter()
         .map(|v| {
@@ -476,6 +476,6 @@ pub fn table_faces(views: &[View], whole: &[RgbaImage]) -> Option<DVec3> {
         .zip(whole)
         .map(|(v, image)| Picture::of(&View { name: String::new(), camera: v.camera, image: image.clone() }, SMALL))
         .collect();
-    let (plane, stands_out) = plane::find(&pictures, &object, centre, mean_up(views), distance)?;
+    let (plane, stands_out) = plane::find(&pictures, &object, center, mean_up(views), distance)?;
     stands_out.then_some(plane.normal)
 }

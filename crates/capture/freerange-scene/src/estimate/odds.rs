@@ -6,7 +6,7 @@ use super::picture::{Picture, STEPS};
 use super::plane::Table;
 use super::shown::Shown;
 
-/// What parting two like neighbours costs, in units of a pixel's log odds.
+/// What parting two like neighbors costs, in units of a pixel's log odds.
 const SMOOTHNESS: f32 = 40.0;
 
 /// No pixel's log odds count for more.
@@ -17,16 +17,16 @@ const TRUST: f32 = 0.99;
 
 const TRUST_MENDING: f32 = 0.5;
 
-/// Most that is believed of the colour that the other views show.
+/// Most that is believed of the color that the other views show.
 const TRUST_OTHERS: f32 = 0.9;
 
 /// Costs are whole numbers: this many to one.
 const UNIT: f32 = 1024.0;
 
-/// Log density of a colour that nobody has seen before: even over Lab.
+/// Log density of a color that nobody has seen before: even over Lab.
 const NOVEL: f32 = -12.9;
 
-/// How likely a colour is that is so far from the one expected: a density in three dimensions that falls exponentially, its logarithm.
+/// How likely a color is that is so far from the one expected: a density in three dimensions that falls exponentially, its logarithm.
 fn log_likely(off: f32, scale: f32) -> f32 {
     -2.0 * off / scale - (std::f32::consts::PI * scale.powi(3)).ln()
 }
@@ -50,15 +50,15 @@ pub(super) fn odds(
             if !wanted(k) {
                 return 0.0;
             }
-            let colour = picture.lab[k];
-            let rest = log_add(behind.log_density(colour) - 0.05, NOVEL - 3.0);
-            // An object may have any colour that the scene has, if seldom.
-            let own = log_add(log_add(object.log_density(colour) - 0.16, NOVEL - 2.3), rest - 3.0);
+            let color = picture.lab[k];
+            let rest = log_add(behind.log_density(color) - 0.05, NOVEL - 3.0);
+            // An object may have any color that the scene has, if seldom.
+            let own = log_add(log_add(object.log_density(color) - 0.16, NOVEL - 2.3), rest - 3.0);
             let rest = match table {
                 Some(table) if table.trust[k] > 0.0 => {
                     let most = if shown.is_some() { TRUST_MENDING } else { TRUST };
                     let (trust, scale) = (most * table.trust[k], table.scale[k]);
-                    let off = picture.smooth[k].distance(table.colour[k]);
+                    let off = picture.smooth[k].distance(table.color[k]);
                     log_add(trust.ln() + log_likely(off, scale), (1.0 - trust).ln() + rest)
                 }
                 _ => rest,
@@ -66,7 +66,7 @@ pub(super) fn odds(
             let own = match shown {
                 Some(shown) if shown.alpha[k] > 0.0 => {
                     let trust = TRUST_OTHERS * shown.alpha[k];
-                    let off = picture.smooth[k].distance(shown.colour[k]);
+                    let off = picture.smooth[k].distance(shown.color[k]);
                     log_add(trust.ln() + log_likely(off, shown.scale), (1.0 - trust).ln() + own)
                 }
                 _ => own,

@@ -1,9 +1,9 @@
-//! A photo as the cut sees it: small, in Lab, with the contrast between neighbours.
+//! A photo as the cut sees it: small, in Lab, with the contrast between neighbors.
 
 use crate::camera::{Camera, View, image_ops::resize_area};
 use glam::{DVec3, DVec4, Vec3};
 
-/// Lengths of the four steps to a pixel's right, lower, lower right and lower left neighbours.
+/// Lengths of the four steps to a pixel's right, lower, lower right and lower left neighbors.
 pub const STEPS: [(i32, i32, f32); 4] =
     [(1, 0, 1.0), (0, 1, 1.0), (1, 1, std::f32::consts::SQRT_2), (-1, 1, std::f32::consts::SQRT_2)];
 
@@ -11,13 +11,13 @@ pub const STEPS: [(i32, i32, f32); 4] =
 pub struct Picture {
     /// Its camera at this size.
     pub camera: Camera,
-    /// CIE Lab colours, `[h, w]`.
+    /// CIE Lab colors, `[h, w]`.
     pub lab: Vec<Vec3>,
     /// The same, a little blurred: to compare with other photos.
     pub smooth: Vec<Vec3>,
     /// Whether the photo shows anything there (an undistorted one has empty corners).
     pub valid: Vec<bool>,
-    /// How much it costs to part two neighbours: 1 where they are alike, near 0 across an edge. `[h, w, 4]`, in the order of [`STEPS`].
+    /// How much it costs to part two neighbors: 1 where they are alike, near 0 across an edge. `[h, w, 4]`, in the order of [`STEPS`].
     pub alike: Vec<[f32; 4]>,
 }
 
@@ -35,7 +35,7 @@ impl Picture {
         for y in 0..h {
             for x in 0..w {
                 for (k, (dx, dy, _)) in STEPS.into_iter().enumerate() {
-                    if let Some(other) = neighbour(x, y, dx, dy, w, h) {
+                    if let Some(other) = neighbor(x, y, dx, dy, w, h) {
                         let d = lab[y * w + x].distance_squared(lab[other]);
                         alike[y * w + x][k] = d;
                         sum += f64::from(d);
@@ -79,7 +79,7 @@ pub fn shrunk(view: &View, side: u32) -> View {
     View { name: view.name.clone(), camera: view.camera.resized(w, h), image: resize_area(&view.image, w, h) }
 }
 
-fn neighbour(x: usize, y: usize, dx: i32, dy: i32, w: usize, h: usize) -> Option<usize> {
+fn neighbor(x: usize, y: usize, dx: i32, dy: i32, w: usize, h: usize) -> Option<usize> {
     let (x, y) = (x.checked_add_signed(dx as isize)?, y.checked_add_signed(dy as isize)?);
     (x < w && y < h).then(|| y * w + x)
 }
@@ -112,7 +112,7 @@ where
     (at(i, j) * (1.0 - fx) + at(i, right) * fx) * (1.0 - fy) + (at(below, j) * (1.0 - fx) + at(below, right) * fx) * fy
 }
 
-/// CIE Lab (D65) of an sRGB colour.
+/// CIE Lab (D65) of an sRGB color.
 pub fn lab(rgb: [u8; 3]) -> Vec3 {
     let linear = rgb.map(|v| {
         let v = f32::from(v) / 255.0;
@@ -133,7 +133,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lab_of_known_colours() {
+    fn lab_of_known_colors() {
         // Bruce Lindbloom's calculator, D65.
         for (rgb, expected) in [
             ([255, 255, 255], Vec3::new(100.0, 0.0, 0.0)),

@@ -28,24 +28,24 @@ pub(super) fn mean_up(views: &[View]) -> DVec3 {
     cameras_up(views).unwrap_or(DVec3::Z)
 }
 
-/// How far the ray through a pixel passes by `centre`.
-fn passes_by(picture: &Picture, centre: DVec3, x: f64, y: f64) -> f64 {
-    (centre - picture.camera.center()).cross(picture.camera.ray_direction(x, y)).length()
+/// How far the ray through a pixel passes by `center`.
+fn passes_by(picture: &Picture, center: DVec3, x: f64, y: f64) -> f64 {
+    (center - picture.camera.center()).cross(picture.camera.ray_direction(x, y)).length()
 }
 
-/// The radius of the sphere about `centre` that the object is expected in: the hint's and a little more, or of the largest that half of the
+/// The radius of the sphere about `center` that the object is expected in: the hint's and a little more, or of the largest that half of the
 /// views show whole, as objects are shown whole. None where most views do not show its middle.
-pub(super) fn expected_radius(pictures: &[Picture], centre: DVec3, hints: &Hints) -> Option<f64> {
+pub(super) fn expected_radius(pictures: &[Picture], center: DVec3, hints: &Hints) -> Option<f64> {
     let mut radii: Vec<f64> = pictures
         .iter()
         .map(|p| {
             let (w, h) = (p.width() as f64, p.height() as f64);
-            let (x, y, z) = p.project(centre);
+            let (x, y, z) = p.project(center);
             if z <= 0.0 || x <= 0.0 || y <= 0.0 || x >= w || y >= h {
                 return 0.0;
             }
             let border = [(0.0, y), (w, y), (x, 0.0), (x, h)];
-            border.iter().map(|(x, y)| passes_by(p, centre, *x, *y)).fold(f64::INFINITY, f64::min)
+            border.iter().map(|(x, y)| passes_by(p, center, *x, *y)).fold(f64::INFINITY, f64::min)
         })
         .collect();
     radii.sort_by(f64::total_cmp);
@@ -53,8 +53,8 @@ pub(super) fn expected_radius(pictures: &[Picture], centre: DVec3, hints: &Hints
     (radius > 0.0).then_some(radius)
 }
 
-pub(super) fn nearness(picture: &Picture, centre: DVec3, radius: f64) -> Vec<f32> {
+pub(super) fn nearness(picture: &Picture, center: DVec3, radius: f64) -> Vec<f32> {
     let (w, h) = (picture.width(), picture.height());
-    let at = |k: usize| passes_by(picture, centre, (k % w) as f64 + 0.5, (k / w) as f64 + 0.5);
+    let at = |k: usize| passes_by(picture, center, (k % w) as f64 + 0.5, (k / w) as f64 + 0.5);
     (0..w * h).map(|k| (at(k) / radius) as f32).collect()
 }

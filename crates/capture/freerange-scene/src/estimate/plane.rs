@@ -1,19 +1,19 @@
 //! The plane that the object stands on: where it is, and what it looks like beneath and behind the object.
 //!
-//! A point of the table has one colour from everywhere, shadows included; a point of the plane where the object stands before it has
-//! the object's colours in some views. So the plane on which the views agree is looked for, and then every view can be told what it
+//! A point of the table has one color from everywhere, shadows included; a point of the plane where the object stands before it has
+//! the object's colors in some views. So the plane on which the views agree is looked for, and then every view can be told what it
 //! would show without the object, from the views that see past it.
 
 use super::picture::{Picture, bilinear};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
-/// Colour differences beyond this count as this (Lab).
+/// Color differences beyond this count as this (Lab).
 const CAP: f32 = 30.0;
 /// Other views that tell a view what is behind the object, at most. More, and doubts about each of them add up to trust.
 const OTHERS: usize = 7;
 
-/// `normal . (x - centre) = height`, with the normal pointing up.
+/// `normal . (x - center) = height`, with the normal pointing up.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Plane {
     /// Unit normal.
@@ -31,18 +31,18 @@ pub fn across(n: DVec3) -> (DVec3, DVec3) {
 }
 
 /// The plane on which the views agree best outside of `object` (`[h, w]` for each picture), and whether it stands out: it does not on a
-/// table of one plain colour.
+/// table of one plain color.
 pub fn find(
     pictures: &[Picture],
     object: &[Vec<bool>],
-    centre: DVec3,
+    center: DVec3,
     up: DVec3,
     distance: f64,
 ) -> Option<(Plane, bool)> {
     let (a, b) = across(up);
     let normal = |tilt: [f64; 2]| (up + tilt[0] * a + tilt[1] * b).normalize();
     let score = |p: [f64; 3], grid: usize| {
-        disagreement(pictures, object, centre, normal([p[0], p[1]]), p[2] * distance, 0.7 * distance, grid)
+        disagreement(pictures, object, center, normal([p[0], p[1]]), p[2] * distance, 0.7 * distance, grid)
     };
     // Farther away little of a plane is seen, and that little may agree by chance: of walls, for one.
     let within = |p: [f64; 3]| p[0].hypot(p[1]) < 0.6 && (-0.5..0.15).contains(&p[2]);
@@ -114,16 +114,16 @@ fn descend(start: [f64; 3], f: impl Fn([f64; 3]) -> f64) -> (f64, [f64; 3]) {
 fn disagreement(
     pictures: &[Picture],
     object: &[Vec<bool>],
-    centre: DVec3,
+    center: DVec3,
     normal: DVec3,
     height: f64,
     radius: f64,
     grid: usize,
 ) -> Option<f64> {
     let (a, b) = across(normal);
-    let origin = centre + height * normal;
+    let origin = center + height * normal;
     let (mut sum, mut count, mut seen, mut all) = (0.0, 0usize, 0usize, 0usize);
-    let mut colours: Vec<Vec3> = Vec::with_capacity(pictures.len());
+    let mut colors: Vec<Vec3> = Vec::with_capacity(pictures.len());
     let mut channel: Vec<f32> = Vec::with_capacity(pictures.len());
     for i in 0..grid * grid {
         let at = |k: usize| (2.0 * (k as f64 + 0.5) / grid as f64 - 1.0) * radius;
@@ -133,7 +133,7 @@ fn disagreement(
         }
         all += 1;
         let point = origin + x * a + y * b;
-        colours.clear();
+        colors.clear();
         for (picture, object) in pictures.iter().zip(object) {
             let (u, v, z) = picture.project(point);
             let (w, h) = (picture.width(), picture.height());
@@ -142,34 +142,34 @@ fn disagreement(
             }
             let at = v as usize * w + u as usize;
             if picture.valid[at] && !object[at] {
-                colours.push(bilinear(&picture.smooth, w, h, u, v));
+                colors.push(bilinear(&picture.smooth, w, h, u, v));
             }
         }
-        if colours.len() < 3 {
+        if colors.len() < 3 {
             continue;
         }
         seen += 1;
         let mut median = Vec3::ZERO;
         for c in 0..3 {
             channel.clear();
-            channel.extend(colours.iter().map(|v| v[c]));
+            channel.extend(colors.iter().map(|v| v[c]));
             channel.sort_by(f32::total_cmp);
             let n = channel.len();
             median[c] = 0.5 * (channel[(n - 1) / 2] + channel[n / 2]);
         }
-        sum += colours.iter().map(|v| f64::from((*v - median).abs().max_element().min(CAP))).sum::<f64>();
-        count += colours.len();
+        sum += colors.iter().map(|v| f64::from((*v - median).abs().max_element().min(CAP))).sum::<f64>();
+        count += colors.len();
     }
     (seen * 7 >= all).then(|| sum / count as f64)
 }
 
 /// What a view would show without the object, as far as it shows the plane.
 pub struct Table {
-    /// The plane's colour, `[h, w]`.
-    pub colour: Vec<Vec3>,
+    /// The plane's color, `[h, w]`.
+    pub color: Vec<Vec3>,
     /// How far it can be relied on, 0 to 1.
     pub trust: Vec<f32>,
-    /// How far colours may differ from it and still be the plane's (Lab).
+    /// How far colors may differ from it and still be the plane's (Lab).
     pub scale: Vec<f32>,
 }
 
@@ -187,7 +187,7 @@ pub fn table(
     pictures: &[Picture],
     background: &[Vec<f32>],
     i: usize,
-    centre: DVec3,
+    center: DVec3,
     plane: &Plane,
     distance: f64,
     wanted: impl Fn(usize) -> bool + Sync,
@@ -196,7 +196,7 @@ pub fn table(
     let (w, h) = (picture.width(), picture.height());
     let others = others(pictures.len(), i);
     let eye = picture.camera.center();
-    let above = (centre + plane.height * plane.normal - eye).dot(plane.normal);
+    let above = (center + plane.height * plane.normal - eye).dot(plane.normal);
     let rows: Vec<Vec<(Vec3, f32, f32)>> = (0..h)
         .into_par_iter()
         .map(|y| {
@@ -212,7 +212,7 @@ pub fn table(
                     let along = above / direction.dot(plane.normal);
                     let point = eye + along * direction;
                     // false for NaN
-                    let near = along > 0.0 && point.distance(centre) < 1.5 * distance;
+                    let near = along > 0.0 && point.distance(center) < 1.5 * distance;
                     if !near {
                         return unknown;
                     }
@@ -233,7 +233,7 @@ pub fn table(
                         return unknown;
                     }
                     let total: f32 = seen.iter().map(|s| s.1).sum();
-                    let mut colour = Vec3::ZERO;
+                    let mut color = Vec3::ZERO;
                     for c in 0..3 {
                         channel.clear();
                         channel.extend(seen.iter().map(|(v, weight)| (v[c], *weight)));
@@ -243,18 +243,18 @@ pub fn table(
                             sum += weight;
                             sum >= 0.5 * total
                         });
-                        colour[c] = half.map_or(0.0, |v| v.0);
+                        color[c] = half.map_or(0.0, |v| v.0);
                     }
                     let spread =
-                        seen.iter().map(|(v, weight)| weight * v.distance(colour).min(40.0)).sum::<f32>() / total;
-                    (colour, ((total - 0.5) / 1.5).clamp(0.0, 1.0), 2.0 + 1.5 * spread)
+                        seen.iter().map(|(v, weight)| weight * v.distance(color).min(40.0)).sum::<f32>() / total;
+                    (color, ((total - 0.5) / 1.5).clamp(0.0, 1.0), 2.0 + 1.5 * spread)
                 })
                 .collect()
         })
         .collect();
     let flat = || rows.iter().flatten();
     Table {
-        colour: flat().map(|v| v.0).collect(),
+        color: flat().map(|v| v.0).collect(),
         trust: flat().map(|v| v.1).collect(),
         scale: flat().map(|v| v.2).collect(),
     }

@@ -12,8 +12,8 @@ pub(super) struct Shown {
     /// `[h, w]`
     pub(super) alpha: Vec<f32>,
     /// `[h, w]`, Lab
-    pub(super) colour: Vec<Vec3>,
-    /// How far colours may differ from it and still be the object's (Lab).
+    pub(super) color: Vec<Vec3>,
+    /// How far colors may differ from it and still be the object's (Lab).
     pub(super) scale: f32,
 }
 
@@ -21,7 +21,7 @@ impl Shown {
     pub(super) fn of(image: &RgbaImage, scale: f32) -> Self {
         Self {
             alpha: image.pixels().map(|p| f32::from(p[3]) / 255.0).collect(),
-            colour: image.pixels().map(|p| picture::lab([p[0], p[1], p[2]])).collect(),
+            color: image.pixels().map(|p| picture::lab([p[0], p[1], p[2]])).collect(),
             scale,
         }
     }

@@ -31,7 +31,7 @@ pub(super) fn read_mask(path: &Path, size: (u32, u32), invert: bool) -> Result<G
     if found == size {
         return Ok(shares);
     }
-    Ok(gray(&resize_area(&coloured(&shares), size.0, size.1)))
+    Ok(gray(&resize_area(&colored(&shares), size.0, size.1)))
 }
 
 fn shares(image: &RgbaImage) -> GrayImage {
@@ -54,7 +54,7 @@ pub(super) fn coverage(mask: &GrayImage) -> (f64, f64) {
     (along as f64 / f64::from(count.max(1)), all as f64 / (f64::from(w) * f64::from(h)))
 }
 
-pub(super) fn coloured(mask: &GrayImage) -> RgbaImage {
+pub(super) fn colored(mask: &GrayImage) -> RgbaImage {
     RgbaImage::from_fn(mask.width(), mask.height(), |x, y| {
         let v = mask.get_pixel(x, y)[0];
         Rgba([v, v, v, 255])

@@ -25,7 +25,7 @@ use aim::Aim;
 use cut::{Told, cut_all, plain, set_alpha};
 use freerange_util::{Invalid, IoError, Note, beside, persist};
 use image::{GrayImage, Luma, RgbaImage};
-use mask_image::{coloured, gray};
+use mask_image::{colored, gray};
 use masks::{MaskFiles, Meaning, mask_files, meaning};
 use picture::{Picture, picture};
 use rayon::prelude::*;
@@ -44,17 +44,17 @@ const RIM_FILL: f64 = 0.6;
 /// Where masks come from.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum MaskSource {
-    /// Mask files that the cameras' file names or that lie in `masks` beside the images; else the images' alpha; else one plain colour
+    /// Mask files that the cameras' file names or that lie in `masks` beside the images; else the images' alpha; else one plain color
     /// behind the object; else [`MaskSource::Estimate`].
     #[default]
     Auto,
     /// The images' alpha.
     Alpha,
-    /// What is not the plain colour of the image's border.
+    /// What is not the plain color of the image's border.
     Plain,
     /// Files in this folder: white is the object.
     Files(PathBuf),
-    /// Poses and colours alone ([`estimate`]).
+    /// Poses and colors alone ([`estimate`]).
     Estimate,
     /// A network of the user's own.
     Model(MaskModel),
@@ -70,7 +70,7 @@ pub enum MaskKind {
     Plain,
     /// Mask files.
     Files,
-    /// Poses and colours.
+    /// Poses and colors.
     Estimate,
     /// A network.
     Model,
@@ -420,7 +420,7 @@ fn mask_names(cameras: &Cameras, which: &[usize]) -> Vec<String> {
 fn mask_as_taken(photo: &Photo, view: &View) -> Result<GrayImage, SceneError> {
     let (w, h) = view.image.dimensions();
     let alpha = GrayImage::from_fn(w, h, |x, y| Luma([view.image.get_pixel(x, y)[3]]));
-    let mut mask = coloured(&alpha);
+    let mut mask = colored(&alpha);
     let (mut full_w, mut full_h) = size_of(&photo.image)?;
     // A photo that was turned, as its camera knows no other.
     if photo.camera((full_w, full_h)).is_err() || photo.is_upright() && (full_w > full_h) != (w > h) && full_w != full_h

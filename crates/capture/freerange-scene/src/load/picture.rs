@@ -4,7 +4,7 @@ use super::{
     LoadConfig, MaskSource,
     aim::Aim,
     cut::set_alpha,
-    mask_image::{coloured, coverage, gray, read_mask},
+    mask_image::{colored, coverage, gray, read_mask},
 };
 use crate::camera::{Camera, Lens, image_ops::resize_area};
 use crate::{
@@ -82,7 +82,7 @@ pub(super) fn picture(
     let aimed = look.is_some();
     if let Some(seen) = look {
         image = photo.lens.seen_by(&image, &camera, &seen);
-        mask = mask.map(|mask| gray(&photo.lens.seen_by(&coloured(&mask), &camera, &seen)));
+        mask = mask.map(|mask| gray(&photo.lens.seen_by(&colored(&mask), &camera, &seen)));
         camera = seen;
     } else if photo.lens != Lens::Ideal {
         if !photo.lens.is_one_to_one(&camera) {
@@ -91,14 +91,14 @@ pub(super) fn picture(
             return Err(In(&photo.image).field("", "distortion", expected, found));
         }
         image = photo.lens.undistort(&image, &camera);
-        mask = mask.map(|mask| gray(&photo.lens.undistort(&coloured(&mask), &camera)));
+        mask = mask.map(|mask| gray(&photo.lens.undistort(&colored(&mask), &camera)));
     }
     let longer = size.0.max(size.1);
     if !aimed && longer > config.max_side {
         let side = |s: u32| ((f64::from(s) * f64::from(config.max_side) / f64::from(longer)).round() as u32).max(1);
         let (w, h) = (side(size.0), side(size.1));
         image = resize_area(&image, w, h);
-        mask = mask.map(|mask| gray(&resize_area(&coloured(&mask), w, h)));
+        mask = mask.map(|mask| gray(&resize_area(&colored(&mask), w, h)));
         camera = camera.resized(w, h);
     }
     Ok(Picture { image, camera, mask, mask_covers, alpha, size, turned, aimed, converted })

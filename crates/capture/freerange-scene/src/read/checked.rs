@@ -36,25 +36,25 @@ pub(crate) fn pinhole(
     Ok(Camera { width, height, fx: focal[0], fy: focal[1], cx: principal[0], cy: principal[1], world_to_camera })
 }
 
-/// World to camera from the camera's axes (columns: right, down, forward, in world coordinates) and its centre.
-pub(crate) fn world_to_camera(file: &Path, place: &str, axes: DMat3, centre: DVec3) -> Result<DMat4, SceneError> {
+/// World to camera from the camera's axes (columns: right, down, forward, in world coordinates) and its center.
+pub(crate) fn world_to_camera(file: &Path, place: &str, axes: DMat3, center: DVec3) -> Result<DMat4, SceneError> {
     let rotation = nearest_rotation(axes)
         .map_err(|found| In(file).field(place, "rotation", "a rotation matrix", found))?
         .transpose();
-    rigid(file, place, rotation, -(rotation * centre), centre)
+    rigid(file, place, rotation, -(rotation * center), center)
 }
 
-/// World to camera from its rotation and translation; `centre` is the camera's.
+/// World to camera from its rotation and translation; `center` is the camera's.
 pub(crate) fn rigid(
     file: &Path,
     place: &str,
     rotation: DMat3,
     translation: DVec3,
-    centre: DVec3,
+    center: DVec3,
 ) -> Result<DMat4, SceneError> {
-    if !(centre.abs().max_element() <= LARGEST_COORDINATE && translation.is_finite()) {
+    if !(center.abs().max_element() <= LARGEST_COORDINATE && translation.is_finite()) {
         let expected = format!("a camera within {LARGEST_COORDINATE} of the origin");
-        return Err(In(file).field(place, "position", &expected, centre));
+        return Err(In(file).field(place, "position", &expected, center));
     }
     Ok(DMat4::from_cols(
         rotation.x_axis.extend(0.0),

@@ -2,7 +2,7 @@
 //!
 //! Written after the format's documentation; points are not read, rigs and frames compared with.
 //! Poses are world to camera with OpenCV's axes,
-//! pixel centres lie at +0.5, numbers in binary files are little-endian.
+//! pixel centers lie at +0.5, numbers in binary files are little-endian.
 
 pub use super::colmap_values::ColmapImage;
 use super::{
@@ -320,8 +320,8 @@ pub(super) fn read(folder: &Path, images_in: Option<&Path>) -> Result<Cameras, S
             return Err(In(&images_file).field(&place, "NAME", "a name of its own", "another image with it"));
         }
         let rotation = DMat3::from_quat(i.rotation);
-        let centre = -(rotation.transpose() * i.translation);
-        let pose = rigid(&images_file, &place, rotation, i.translation, centre)?;
+        let center = -(rotation.transpose() * i.translation);
+        let pose = rigid(&images_file, &place, rotation, i.translation, center)?;
         let place = format!("camera {}", i.camera);
         let pixels = pinhole(&cameras_file, &place, camera.size, camera.focal, camera.principal, pose)?;
         let Some(image) = found.find(&i.name)? else { continue };

@@ -308,10 +308,10 @@ fn component_moves<'c>(
 }
 
 pub(super) fn read(file: &Path, images: Option<&Path>) -> Result<Cameras, SceneError> {
-    let Export { photos: labelled, mut notes } = parse(file, &bytes_of(file)?)?;
+    let Export { photos: labeled, mut notes } = parse(file, &bytes_of(file)?)?;
     let mut found = Photos::beside(file, images);
     let mut photos = Vec::new();
-    for l in labelled {
+    for l in labeled {
         if let Some(image) = found.find(&l.label)? {
             let intrinsics = Intrinsics::Pixels(l.camera);
             photos.push(Photo { name: l.label, image, mask: None, intrinsics, lens: l.lens, further: false });

@@ -52,7 +52,7 @@ fn noise(x: f32, y: f32, seed: u64) -> f32 {
 
 struct Room {
     cloth: Cloth,
-    colours: [Vec3; 3],
+    colors: [Vec3; 3],
     floor: f32,
     seed: u64,
 }
@@ -60,7 +60,7 @@ struct Room {
 impl Room {
     /// Linear reflectance of the table.
     fn table(&self, x: f32, y: f32) -> Vec3 {
-        let [a, b, c] = self.colours;
+        let [a, b, c] = self.colors;
         match self.cloth {
             Cloth::Wood => {
                 let bend = 2.0 * noise(0.8 * x, 3.0 * y, self.seed);
@@ -82,7 +82,7 @@ impl Room {
 
     /// Linear radiance of the walls, four units away, and of the floor.
     fn wall(&self, eye: Vec3, d: Vec3) -> Vec3 {
-        let [_, b, c] = self.colours;
+        let [_, b, c] = self.colors;
         let reach = |e: f32, d: f32| if d == 0.0 { f32::MAX } else { ((4.0 * d.signum()) - e) / d };
         let (tx, ty) = (reach(eye.x, d.x), reach(eye.y, d.y));
         let t = tx.min(ty);
@@ -115,12 +115,12 @@ pub fn tabletop(seed: u64, count: usize, turn: f64, size: (u32, u32)) -> Tableto
     let mesh = generate(seed, &config).unwrap();
     let cloth = [Cloth::Wood, Cloth::Checks, Cloth::Speckles, Cloth::Plain, Cloth::Print][rng.random_range(0..5)];
     let kind = kind_of(seed, &config).unwrap();
-    let mut colour = || {
+    let mut color = || {
         let value: f32 = rng.random_range(0.08..0.7);
         value * Vec3::new(rng.random_range(0.6..1.0), rng.random_range(0.6..1.0), rng.random_range(0.4..1.0))
     };
-    let colours = [colour(), colour(), colour()];
-    let room = Room { cloth, colours, floor: lowest(&mesh), seed };
+    let colors = [color(), color(), color()];
+    let room = Room { cloth, colors, floor: lowest(&mesh), seed };
     let others = rng.random_range(0..4usize);
     let mut scenes = vec![Scene::new(mesh, &lighting).unwrap()];
     for i in 0..others {
@@ -189,13 +189,13 @@ fn photo(scenes: &[Scene], room: &Room, light: &Lighting, camera: &Camera, seed:
             room.wall(eye, d)
         };
         let grain = 6.0 * (hash(i64::from(x), i64::from(y), seed + 11) - 0.5);
-        let mut colour = radiance.to_array().map(|v| tone(v) + grain);
+        let mut color = radiance.to_array().map(|v| tone(v) + grain);
         for i in &order {
             let over = pictures[*i].get_pixel(x, y).0;
             let a = f32::from(over[3]) / 255.0;
-            (0..3).for_each(|c| colour[c] = colour[c] * (1.0 - a) + (f32::from(over[c]) + grain) * a);
+            (0..3).for_each(|c| color[c] = color[c] * (1.0 - a) + (f32::from(over[c]) + grain) * a);
         }
-        let [r, g, b] = colour.map(|v| v.clamp(0.0, 255.0) as u8);
+        let [r, g, b] = color.map(|v| v.clamp(0.0, 255.0) as u8);
         Rgba([r, g, b, 255])
     });
     (image, alone)

@@ -1,7 +1,7 @@
 //! Objects as pictures on one sheet.
 
 use crate::Object;
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_optim::{over_white, render_over_white};
 use freerange_util::Invalid;
 use image::{Rgb, RgbImage, RgbaImage};
@@ -20,7 +20,7 @@ const MAX_SHEET: u64 = 16384;
 /// # Errors
 /// [`BuildError::Config`] for a sheet of no or too many pixels; the errors of `objects`.
 pub fn contact_sheet(
-    objects: impl ExactSizeIterator<Item = Result<(Object, Option<Cloud>), BuildError>>,
+    objects: impl ExactSizeIterator<Item = Result<(Object, Option<Gaussians>), BuildError>>,
     columns: u64,
 ) -> Result<RgbaImage, BuildError> {
     let count = objects.len() as u64;
@@ -63,7 +63,7 @@ pub fn contact_sheet(
 }
 
 /// The pictures of an object on a contact sheet, at least one.
-fn pictures(object: &Object, leaves: Option<&Cloud>) -> Result<Vec<RgbImage>, BuildError> {
+fn pictures(object: &Object, leaves: Option<&Gaussians>) -> Result<Vec<RgbImage>, BuildError> {
     let depths: Vec<u32> = object.slices.keys().copied().collect();
     let no = |what: &str| {
         BuildError::from(Invalid::new(

@@ -24,7 +24,7 @@ pub enum BuildError {
     /// The mesh or its renderer.
     #[error(transparent)]
     Mesh(#[from] freerange_assets::mesh::MeshError),
-    /// The rasteriser.
+    /// The rasterizer.
     #[error(transparent)]
     Raster(#[from] freerange_raster::RasterError),
     /// The measures of image quality.

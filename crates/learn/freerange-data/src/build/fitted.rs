@@ -2,7 +2,7 @@
 
 use std::ops::ControlFlow;
 
-use freerange_gaussians::{Cloud, OPACITY_RANGE, channel};
+use freerange_gaussians::{Gaussians, OPACITY_RANGE, channel};
 use freerange_optim::{FitConfig, Rates, fit};
 use freerange_scene::camera::View;
 use rand::Rng;
@@ -16,7 +16,10 @@ const START_SPREAD: f32 = 0.8;
 
 /// 3DGS-MCMC on the views. Starts from points on the surface, which a mesh has and a photographed object lacks, wide and
 /// of the opacity `fit.initial_opacity`: faint enough that what is behind them is seen and learns.
-pub(crate) fn fitted_gaussians(photographed: &mut Photographed, config: &ObjectConfig) -> Result<Cloud, BuildError> {
+pub(crate) fn fitted_gaussians(
+    photographed: &mut Photographed,
+    config: &ObjectConfig,
+) -> Result<Gaussians, BuildError> {
     let start = SurfaceConfig {
         points: config.fit.initial.min(config.fit.cap_max),
         spread: START_SPREAD,
@@ -30,18 +33,18 @@ pub(crate) fn fitted_gaussians(photographed: &mut Photographed, config: &ObjectC
 
 /// `slice` after `steps` gradient steps, each towards one of the `views`; its rows stay what and where they are in the
 /// order of the tree. Opacities stay within [`OPACITY_RANGE`].
-pub(crate) fn polished(slice: Cloud, views: &[View], steps: usize, seed: u64) -> Result<Cloud, BuildError> {
+pub(crate) fn polished(slice: Gaussians, views: &[View], steps: usize, seed: u64) -> Result<Gaussians, BuildError> {
     adapted(slice, views, steps, POLISH_RATES, seed)
 }
 
 /// As [`polished`], at these rates.
 pub(crate) fn adapted(
-    slice: Cloud,
+    slice: Gaussians,
     views: &[View],
     steps: usize,
     rates: Rates,
     seed: u64,
-) -> Result<Cloud, BuildError> {
+) -> Result<Gaussians, BuildError> {
     if steps == 0 {
         return Ok(slice);
     }

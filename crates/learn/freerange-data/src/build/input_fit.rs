@@ -72,7 +72,7 @@ mod tests {
     use super::*;
     use crate::build::generate_object;
     use crate::build::tests::tiny_config;
-    use freerange_gaussians::Cloud;
+    use freerange_gaussians::Gaussians;
     use freerange_optim::QuickFitConfig;
     use freerange_optim::psnr_over_white;
 
@@ -96,7 +96,7 @@ mod tests {
             assert_eq!(fit.gaussians.len(), 64);
             assert_eq!(fit.depth(), 6);
             // Mended, they are the same ones, and show all views better.
-            let psnr = |cloud: &Cloud| psnr_over_white(cloud, &with.views).unwrap();
+            let psnr = |cloud: &Gaussians| psnr_over_white(cloud, &with.views).unwrap();
             assert!(psnr(&fit.mended) > psnr(&fit.gaussians) + 1.0);
             let moved = |i: usize| fit.gaussians.mean(i).distance(fit.mended.mean(i));
             assert!((0..64).map(moved).sum::<f64>() / 64.0 < 0.1);

@@ -6,7 +6,7 @@ use std::time::Instant;
 use crate::{DataError, HeldOutPsnr, Object, ObjectSource};
 use freerange_assets::generate::generate;
 use freerange_assets::mesh::Mesh;
-use freerange_gaussians::{Cloud, LodTree};
+use freerange_gaussians::{Gaussians, LodTree};
 use freerange_optim::psnr_over_white;
 
 use crate::build::fitted::{fitted_gaussians, polished};
@@ -49,7 +49,7 @@ impl ObjectSource for Generated {
 pub(crate) struct MadeObject {
     pub object: Object,
     /// The Gaussians before the tree.
-    pub leaves: Cloud,
+    pub leaves: Gaussians,
     /// None where no view was held out.
     pub psnr: Option<HeldOutPsnr>,
     pub seconds: Seconds,

@@ -2,7 +2,7 @@
 
 use std::time::Instant;
 
-use freerange_gaussians::{Cloud, LodTree};
+use freerange_gaussians::{Gaussians, LodTree};
 use freerange_optim::{FitConfig, psnr_over_white};
 use freerange_util::check;
 
@@ -62,7 +62,7 @@ pub fn measure_quality(item: &Item, config: &BuildConfig, counts: &[usize]) -> R
     let object = &config.object;
     let mut photographed = Photographed::new(mesh, seed, object, config.shard.held_out, &mut Seconds::default())?;
 
-    let timed = |photographed: &mut Photographed, fit: FitConfig| -> Result<(Cloud, f64, f64), BuildError> {
+    let timed = |photographed: &mut Photographed, fit: FitConfig| -> Result<(Gaussians, f64, f64), BuildError> {
         let start = Instant::now();
         let cloud = fitted_gaussians(photographed, &ObjectConfig { fit, ..object.clone() })?;
         let mut seconds = 0.0;

@@ -1,7 +1,7 @@
-//! Gaussians straight from a mesh: points by area, flat along the normal, coloured as rendered, opaque.
+//! Gaussians straight from a mesh: points by area, flat along the normal, colored as rendered, opaque.
 
 use freerange_assets::render::{Scene, sample_surface};
-use freerange_gaussians::{Cloud, channel};
+use freerange_gaussians::{Gaussians, channel};
 use glam::{Mat3, Quat, Vec3};
 use rand_chacha::ChaCha8Rng;
 
@@ -28,7 +28,7 @@ impl Default for SurfaceConfig {
 }
 
 /// One Gaussian per surface point.
-pub fn surface_gaussians(mesh: &Scene, config: &SurfaceConfig, rng: &mut ChaCha8Rng) -> Cloud {
+pub fn surface_gaussians(mesh: &Scene, config: &SurfaceConfig, rng: &mut ChaCha8Rng) -> Gaussians {
     let points = sample_surface(mesh, config.points, rng);
     let logit = (config.opacity / (1.0 - config.opacity)).ln();
     let mut rows = Vec::with_capacity(points.len() * channel::COUNT);
@@ -42,7 +42,7 @@ pub fn surface_gaussians(mesh: &Scene, config: &SurfaceConfig, rng: &mut ChaCha8
         rows.push(logit);
         rows.extend_from_slice(&p.color);
     }
-    Cloud::from_rows(rows)
+    Gaussians::from_rows(rows)
 }
 
 /// The rotation that takes the local z axis to `normal`.

@@ -3,7 +3,7 @@
 use std::ops::ControlFlow;
 
 use burn::tensor::{Device, Tensor, TensorData};
-use freerange_gaussians::{Cloud, channel};
+use freerange_gaussians::{Gaussians, channel};
 use freerange_model::{Checkpoint, Feedback};
 use freerange_scene::camera::View;
 use freerange_util::Invalid;
@@ -42,7 +42,7 @@ impl FlowSampler<'_> {
         objects: &[&[View]],
         seeds: &[u64],
         mut progress: impl FnMut(&Estimate<'_>) -> ControlFlow<()>,
-    ) -> Result<Vec<Cloud>, FlowError> {
+    ) -> Result<Vec<Gaussians>, FlowError> {
         let &Self { checkpoint, config, device } = self;
         config.validate().and_then(|()| config.validate_for(checkpoint.config.kind)).map_err(|e| e.within("sample"))?;
         if objects.is_empty() || seeds.is_empty() {
@@ -86,7 +86,7 @@ impl FlowSampler<'_> {
         objects: &[&[View]],
         seeds: &[u64],
         mut progress: impl FnMut(&Estimate<'_>) -> ControlFlow<()>,
-    ) -> Result<Vec<Cloud>, FlowError> {
+    ) -> Result<Vec<Gaussians>, FlowError> {
         let &Self { checkpoint, config, device } = self;
         if seeds.len() > 1 {
             let kind = checkpoint.config.kind.name();

@@ -4,7 +4,7 @@
 use std::ops::ControlFlow;
 
 use burn::tensor::{Device, Tensor, TensorData};
-use freerange_gaussians::{Cloud, channel};
+use freerange_gaussians::{Gaussians, channel};
 use freerange_model::Checkpoint;
 use freerange_optim::tree_slice;
 use freerange_scene::camera::View;
@@ -43,9 +43,9 @@ impl Refiner<'_> {
     pub fn refine(
         &self,
         objects: &[&[View]],
-        proposals: &[Cloud],
+        proposals: &[Gaussians],
         mut progress: impl FnMut(&Estimate<'_>) -> ControlFlow<()>,
-    ) -> Result<Vec<Cloud>, FlowError> {
+    ) -> Result<Vec<Gaussians>, FlowError> {
         let &Self { checkpoint, config, device } = self;
         config.validate().map_err(|e| e.within("refiner"))?;
         let b = proposals.len();
@@ -61,7 +61,7 @@ impl Refiner<'_> {
         let n = gaussians(&checkpoint.config, "refiner.lod_depth", depth)?;
         let sets = b / objects.len();
         let network = Conditioned::new(checkpoint, objects, sets, config.gradient_size, config.compute, device)?;
-        let tokenized = |clouds: &[Cloud]| {
+        let tokenized = |clouds: &[Gaussians]| {
             let mut rows = Vec::with_capacity(b * n * channel::COUNT);
             for cloud in clouds {
                 rows.extend(checkpoint.normalization.normalize(&tree_slice(cloud, depth)?));

@@ -147,7 +147,7 @@ impl EncoderConfig {
         }
     }
 
-    /// Appearance features per patch, before position, colour and ray are appended.
+    /// Appearance features per patch, before position, color and ray are appended.
     pub fn features(&self) -> usize {
         match self {
             Self::Patch(c) => c.channels * (c.patch_size * c.patch_size) as usize,

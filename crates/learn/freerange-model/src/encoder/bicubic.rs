@@ -32,7 +32,7 @@ fn plain_taps(from: usize, to: usize) -> Vec<Taps> {
         .collect()
 }
 
-/// The kernel stretched to the target's spacing when shrinking, cut at the edge and normalised (Pillow's, a = -0.5).
+/// The kernel stretched to the target's spacing when shrinking, cut at the edge and normalized (Pillow's, a = -0.5).
 fn antialiased_taps(from: usize, to: usize) -> Vec<Taps> {
     let scale = from as f64 / to as f64;
     let stretch = scale.max(1.0);

@@ -179,7 +179,7 @@ impl Dinov2 {
 
     /// All tokens after the final norm: class, registers, patches row by row.
     ///
-    /// `pixels`: `[b, 3, h, w]`, normalised by the mean and deviation of ImageNet. Returns `[b, 1 + registers + patches, d]`.
+    /// `pixels`: `[b, 3, h, w]`, normalized by the mean and deviation of ImageNet. Returns `[b, 1 + registers + patches, d]`.
     ///
     /// # Panics
     /// If the images are not RGB or smaller than a patch.
@@ -204,7 +204,7 @@ impl Dinov2 {
 }
 
 /// RGB in 0..1, `[b, 3, h, w]`, to ImageNet's zero mean and unit deviation.
-pub(crate) fn imagenet_normalised(images: Tensor<4>) -> Tensor<4> {
+pub(crate) fn imagenet_normalized(images: Tensor<4>) -> Tensor<4> {
     let device = images.device();
     let row = |values: [f32; 3]| Tensor::<1>::from_floats(values, &device).reshape([1, 3, 1, 1]);
     (images - row([0.485, 0.456, 0.406])) / row([0.229, 0.224, 0.225])

@@ -1,6 +1,6 @@
 //! From posed images to image tokens.
 //!
-//! A token is one patch: appearance features, sin-cos position, mean colour, Plücker ray, side by side.
+//! A token is one patch: appearance features, sin-cos position, mean color, Plücker ray, side by side.
 
 pub(crate) mod bicubic;
 pub(crate) mod dinov2;
@@ -61,7 +61,7 @@ impl ImageEncoder {
     /// Image tokens.
     ///
     /// - `images`: `[b, views, h, w, channels]` in 0..1; `h` and `w` multiples of the patch
-    /// - `plucker`: rays of the patch centres, `[b, views, rows, columns, 6]`
+    /// - `plucker`: rays of the patch centers, `[b, views, rows, columns, 6]`
     ///
     /// Returns `[b, views * rows * columns, features + position + 3 + 6]`; view by view, row by row.
     ///
@@ -77,12 +77,12 @@ impl ImageEncoder {
         let tokens = views * rows * columns;
 
         let patches = patches(images.clone(), p) * 2.0 - 1.0; // [b, tokens, p * p * channels]
-        let colour = patches.clone().reshape([b, tokens, p * p, channels]).mean_dim(2).reshape([b, tokens, channels]);
+        let color = patches.clone().reshape([b, tokens, p * p, channels]).mean_dim(2).reshape([b, tokens, channels]);
         let features = match self.published {
             true => {
                 let dinov2 = self.dinov2.as_ref().expect("the frozen encoder is in its place");
                 let images = images.reshape([b * views, h, w, channels]).permute([0, 3, 1, 2]);
-                let features = dinov2.patch_features(dinov2::imagenet_normalised(images)).detach();
+                let features = dinov2.patch_features(dinov2::imagenet_normalized(images)).detach();
                 features.reshape([b, tokens, dinov2.hidden()])
             }
             false => patches,
@@ -91,7 +91,7 @@ impl ImageEncoder {
         let position = TensorData::new(position, [1, rows * columns, self.position_features]);
         let position = Tensor::<3>::from_data(position, &features.device()).repeat(&[b, views, 1]);
         let rays = plucker.reshape([b, tokens, PLUCKER]);
-        Tensor::cat(vec![features, position, colour.narrow(2, 0, 3), rays], 2)
+        Tensor::cat(vec![features, position, color.narrow(2, 0, 3), rays], 2)
     }
 }
 

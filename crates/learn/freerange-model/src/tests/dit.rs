@@ -252,7 +252,7 @@ fn what_is_known_is_corrected() {
     let without = Feedback { estimate: None, ..feedback.clone() };
     let run = |f: Feedback| numbers(model.denoise(z.clone(), f, images.clone(), t()));
     let [with, without] = [feedback, without].map(run);
-    // Without an estimate, as much is left to tell as normalised Gaussians vary.
+    // Without an estimate, as much is left to tell as normalized Gaussians vary.
     assert!((0..8 * 14).any(|i| ((with[i] - 0.7) / 0.5 - without[i]).abs() > 1e-3), "the network sees it");
     assert_eq!(with[2 * 8 * 14..], without[2 * 8 * 14..], "at the end nothing is left to correct");
 }

@@ -21,7 +21,7 @@ fn counting<const D: usize>(shape: [usize; D], step: f32) -> Tensor<D> {
 }
 
 #[test]
-fn a_token_holds_its_patch_position_colour_and_ray() {
+fn a_token_holds_its_patch_position_color_and_ray() {
     let (b, views, side, p, c) = (2, 3, 8, 4, 4);
     let encoder = EncoderConfig::Patch(PatchConfig { patch_size: p as u32, channels: c });
     let config = config(encoder, side as u32);
@@ -81,7 +81,7 @@ fn dinov2_features_become_tokens() {
     let tokens = published.encode(image.clone(), rays);
     assert_eq!(tokens.dims(), [1, 8, 48 + 41]);
     assert_ne!(numbers(tokens.clone()), before);
-    // ImageNet's normalisation, spelled out for the second view.
+    // ImageNet's normalization, spelled out for the second view.
     let pixels = numbers(image)[28 * 28 * 3..].to_vec();
     let mut planes = vec![0f32; pixels.len()];
     for (i, rgb) in pixels.chunks_exact(3).enumerate() {

@@ -11,7 +11,7 @@ use crate::ranks::{Ranks, Single};
 pub struct Initial<'a> {
     /// The weights, of the same architecture.
     pub checkpoint: &'a Checkpoint,
-    /// Normalise Gaussians by the statistics of the run's own data, not by the checkpoint's: for data that
+    /// Normalize Gaussians by the statistics of the run's own data, not by the checkpoint's: for data that
     /// are made in another way, such as fits instead of points on the surface.
     pub remeasure: bool,
 }

@@ -9,7 +9,7 @@ use freerange_util::sha256;
 use super::Initial;
 use crate::{TrainError, config::TrainConfig, validation::Validation};
 
-/// What a new run normalises Gaussians by.
+/// What a new run normalizes Gaussians by.
 pub(super) fn normalization(
     config: &TrainConfig,
     initial: Option<Initial>,
@@ -75,7 +75,7 @@ fn made<M: Making>(config: &TrainConfig<M>, farther: u64) -> Arc<dyn ObjectSourc
     config.data.making.source(config.depths(), seed)
 }
 
-/// Normalisation statistics over the first `count` objects at `depth`.
+/// Normalization statistics over the first `count` objects at `depth`.
 fn measure(source: &dyn ObjectSource, count: u64, depth: u32) -> Result<Normalization, TrainError> {
     use rayon::prelude::*;
     // Partial statistics are merged in the order of the objects, so that the result does not depend on threads.

@@ -16,7 +16,7 @@ use crate::{
     weights::Weights,
 };
 
-/// The part of the state that is neither weights nor optimiser.
+/// The part of the state that is neither weights nor optimizer.
 #[derive(Clone, Debug, serde::Serialize, serde::Deserialize)]
 pub(super) struct Progress {
     pub(super) step: u64,
@@ -139,7 +139,7 @@ impl State {
             }
             model = Weights::of(&known).apply(model);
         }
-        // The gradient by normalised Gaussians grows with what they were divided by.
+        // The gradient by normalized Gaussians grows with what they were divided by.
         let square = |i: usize, old: &Checkpoint| {
             (old.gradient_rms[i] * normalization.std[i] / old.normalization.std[i]).powi(2)
         };

@@ -129,7 +129,7 @@ impl Trainer {
             };
             data_seconds += begin.elapsed().as_secs_f64();
             let share = batch.t.len() as f32 / stage.batch as f32;
-            // Gone before the optimiser, which changes weights in place that nobody else holds.
+            // Gone before the optimizer, which changes weights in place that nobody else holds.
             let whole = self.model().clone().put_dinov2(self.frozen.clone());
             let losses = train::step(&whole, batch, &self.photometric, &rms, &self.config.loss, &self.device)?;
             drop(whole);

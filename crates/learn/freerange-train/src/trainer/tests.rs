@@ -333,7 +333,7 @@ fn other_objects_are_measured_now_and_then_and_nothing_else_changes() {
 }
 
 #[test]
-fn the_frozen_encoder_is_neither_averaged_nor_optimised_nor_saved() {
+fn the_frozen_encoder_is_neither_averaged_nor_optimized_nor_saved() {
     let place = tempfile::tempdir().unwrap();
     let golden = freerange_vectors::path("dino/mlp_img56");
     let weights = freerange_model::EncoderWeights { name: "golden".into(), folder: golden.clone() };

@@ -261,11 +261,11 @@ fn distance(views: &Views, point: DVec3, step: f64) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use freerange_gaussians::{Cloud, channel};
+    use freerange_gaussians::{Gaussians, channel};
 
     /// Flat Gaussians on a ball, red above and blue below.
     fn ball(n: usize, radius: f64) -> Splats {
-        let mut cloud = Cloud::default();
+        let mut cloud = Gaussians::default();
         for i in 0..n {
             let z = 1.0 - 2.0 * (i as f64 + 0.5) / n as f64;
             let turn = i as f64 * 2.399_963;

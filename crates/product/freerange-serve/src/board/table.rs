@@ -7,7 +7,7 @@ use std::{
     time::Instant,
 };
 
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use serde_json::{Value, json};
 
 use super::clear;
@@ -110,6 +110,6 @@ impl Job {
 /// Bytes of a Gaussian.
 const ROW: usize = 4 * freerange_gaussians::channel::COUNT;
 
-pub(super) fn bytes(cloud: &Cloud) -> Vec<u8> {
+pub(super) fn bytes(cloud: &Gaussians) -> Vec<u8> {
     cloud.rows().iter().flat_map(|v| v.to_le_bytes()).collect()
 }

@@ -11,7 +11,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use freerange_gaussians::{Cloud, write_ply};
+use freerange_gaussians::{Gaussians, write_ply};
 use freerange_scene::camera::{
     Camera,
     image_ops::{composite, resize_area, to_picture},
@@ -211,7 +211,7 @@ impl Board {
     }
 
     /// Shows a step to everyone who looks.
-    fn publish(&self, id: &str, step: &Step<'_>, parts: Vec<(usize, Cloud)>, cancel: &AtomicBool) {
+    fn publish(&self, id: &str, step: &Step<'_>, parts: Vec<(usize, Gaussians)>, cancel: &AtomicBool) {
         let parts: Vec<_> = parts.into_iter().map(|(sample, cloud)| (sample, Arc::new(bytes(&cloud)))).collect();
         let mut table = self.table();
         let version = table.next_version();

@@ -15,7 +15,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use freerange_gaussians::{Cloud, channel};
+use freerange_gaussians::{Gaussians, channel};
 use freerange_scene::camera::{Camera, View};
 use freerange_scene::estimate::OthersShow;
 use freerange_serve::{Engine, EngineError, Example, JobOptions, Outcome, Scene, ServeConfig, Server, Step, Stopper};
@@ -60,7 +60,7 @@ impl Fake {
         Arc::new(Self { pause: Duration::from_millis(20), steps: 2000, ..Self::default() })
     }
 
-    pub fn cloud(seed: u64, done: usize) -> Cloud {
+    pub fn cloud(seed: u64, done: usize) -> Gaussians {
         let mut rows = Vec::new();
         for i in 0..40 {
             let mut row = [0.0; channel::COUNT];
@@ -70,7 +70,7 @@ impl Fake {
             (row[3], row[4], row[5], row[6], row[10], row[11]) = (-3.0, -3.0, -3.0, 1.0, 2.0, 0.5);
             rows.extend(row);
         }
-        Cloud::from_rows(rows)
+        Gaussians::from_rows(rows)
     }
 }
 
@@ -123,7 +123,7 @@ impl Engine for Fake {
         })
     }
 
-    fn picture(&self, cloud: &Cloud, camera: &Camera) -> Result<RgbaImage, String> {
+    fn picture(&self, cloud: &Gaussians, camera: &Camera) -> Result<RgbaImage, String> {
         let shade = (cloud.len() % 256) as u8;
         Ok(RgbaImage::from_pixel(camera.width, camera.height, image::Rgba([shade, 0, 0, 255])))
     }

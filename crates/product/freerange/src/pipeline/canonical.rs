@@ -4,7 +4,7 @@
 //! Masks and cameras give a first frame; where the scene does not already lie in the canonical one, a short fit corrects it
 //! (docs/research/experiments/initial-fits.md). Cost: a third of a second for that fit.
 
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_optim::{frame_of, quick_fit};
 use freerange_scene::camera::{Similarity, View, Window};
 use freerange_util::Note;
@@ -23,7 +23,7 @@ pub(crate) struct CanonicalScene {
     /// What the user should know.
     pub notes: Vec<Note>,
     /// An initial fit of the network's views, of seed 0, if there was reason to make one.
-    pub fit: Option<Cloud>,
+    pub fit: Option<Gaussians>,
 }
 
 impl CanonicalScene {
@@ -95,7 +95,7 @@ impl CanonicalScene {
 
     /// The user's Gaussians in the canonical frame. Those outside of the object's sphere, with a margin of a fifth, are left
     /// out.
-    pub fn user_proposal(&mut self, init: &Cloud) -> Result<Cloud, Error> {
+    pub fn user_proposal(&mut self, init: &Gaussians) -> Result<Gaussians, Error> {
         const RADIUS: f64 = 0.6;
         let Similarity { scale, rotation, translation } = self.canonical_from_user;
         let mut cloud = init.clone();

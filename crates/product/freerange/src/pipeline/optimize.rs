@@ -4,7 +4,7 @@
 //!
 //! Cost: half of the pipeline's time; memory of the photos at `max_resolution`.
 
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_optim::{HoldConfig, RefineConfig, refine};
 
 use super::{CanonicalScene, symmetry::Targets, watch::Watch};
@@ -15,10 +15,10 @@ pub(crate) fn optimize(
     scene: &CanonicalScene,
     targets: &Targets,
     config: &OptimizeConfig,
-    proposals: &[Cloud],
+    proposals: &[Gaussians],
     seed: u64,
     watch: &mut Watch<'_>,
-) -> Result<Cloud, Error> {
+) -> Result<Gaussians, Error> {
     let (first, others) = proposals.split_first().expect("at least one proposal");
     if config.iterations == 0 {
         return Ok(first.clone());

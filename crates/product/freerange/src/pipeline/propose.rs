@@ -7,7 +7,7 @@
 use std::ops::ControlFlow;
 
 use freerange_diffusion::sample::FlowSampler;
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_optim::quick_fit;
 use freerange_util::side_by_side;
 
@@ -29,7 +29,7 @@ pub(crate) fn propose(
     options: &Options,
     seed: u64,
     watch: &mut Watch<'_>,
-) -> Result<Vec<Cloud>, Error> {
+) -> Result<Vec<Gaussians>, Error> {
     let config = &options.pipeline.propose;
     if let Some(init) = &options.init {
         watch.report(Stage::Propose, [0, 1], None, None)?;
@@ -61,7 +61,7 @@ fn fits(
     options: &Options,
     seed: u64,
     watch: &mut Watch<'_>,
-) -> Result<Vec<Cloud>, Error> {
+) -> Result<Vec<Gaussians>, Error> {
     let config = &options.pipeline.propose;
     let numbers: Vec<u64> = (0..config.count as u64).map(|i| seed.wrapping_mul(MOST).wrapping_add(i)).collect();
     // The fit that found the object's place is that of number 0.
@@ -72,7 +72,7 @@ fn fits(
     let jobs = numbers.iter().enumerate().map(|(i, &number)| {
         // One fit is enough to look at.
         let previewed = i == 0;
-        move |tell: &mut dyn FnMut((f64, Option<Cloud>)) -> ControlFlow<()>| match known(number) {
+        move |tell: &mut dyn FnMut((f64, Option<Gaussians>)) -> ControlFlow<()>| match known(number) {
             Some(known) => Ok(known.clone()),
             None => {
                 quick_fit(evidence.clone(), &config.fit, number, |p| tell((p.loss, previewed.then(|| p.cloud.clone()))))

@@ -7,7 +7,7 @@
 use std::ops::ControlFlow;
 
 use freerange_diffusion::sample::{Estimate, Refiner};
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_optim::tree_slice;
 use freerange_util::side_by_side;
 
@@ -27,9 +27,9 @@ pub(crate) fn refine(
     scene: &CanonicalScene,
     targets: &Targets,
     options: &Options,
-    proposals: Vec<Cloud>,
+    proposals: Vec<Gaussians>,
     watch: &mut Watch<'_>,
-) -> Result<Vec<Cloud>, Error> {
+) -> Result<Vec<Gaussians>, Error> {
     let Some(config) = &options.pipeline.refine else { return Ok(proposals) };
     if options.without_network {
         // As many Gaussians as the network would make.
@@ -51,9 +51,9 @@ pub(crate) fn each(
     stage: Stage,
     scene: &CanonicalScene,
     [count, steps]: [usize; 2],
-    make: &(dyn Fn(usize, &mut OnEstimate<'_>) -> Result<Cloud, Error> + Sync),
+    make: &(dyn Fn(usize, &mut OnEstimate<'_>) -> Result<Gaussians, Error> + Sync),
     watch: &mut Watch<'_>,
-) -> Result<Vec<Cloud>, Error> {
+) -> Result<Vec<Gaussians>, Error> {
     let (mut done, total, place) = (0, count * steps, &scene.canonical_from_user);
     watch.report(stage, [0, total], None, None)?;
     let mut stopped = Ok(());
@@ -62,7 +62,7 @@ pub(crate) fn each(
         stopped = watch.report(stage, [done, total], None, preview.map(|p| (p, place)));
         flow(&stopped)
     };
-    let made: Result<Vec<Cloud>, Error> = if *model.device() == Device::cpu() {
+    let made: Result<Vec<Gaussians>, Error> = if *model.device() == Device::cpu() {
         let job = |i: usize| {
             move |tell: &mut dyn FnMut(_) -> ControlFlow<()>| {
                 make(i, &mut |estimate| tell((i == 0).then(|| estimate.clouds())))

@@ -2,7 +2,7 @@
 
 use std::{ops::ControlFlow, time::Instant};
 
-use freerange_gaussians::Cloud;
+use freerange_gaussians::Gaussians;
 use freerange_optim::{FitError, FitProgress};
 use freerange_scene::camera::Similarity;
 
@@ -58,8 +58,8 @@ impl<'a> Watch<'a> {
         stage: Stage,
         total: usize,
         canonical_from_user: &Similarity,
-        fit: impl FnOnce(&mut dyn FnMut(&FitProgress<'_>) -> ControlFlow<()>) -> Result<Cloud, FitError>,
-    ) -> Result<Cloud, Error> {
+        fit: impl FnOnce(&mut dyn FnMut(&FitProgress<'_>) -> ControlFlow<()>) -> Result<Gaussians, FitError>,
+    ) -> Result<Gaussians, Error> {
         self.report(stage, [0, total], None, None)?;
         let mut stopped = Ok(());
         let cloud = fit(&mut |p| {

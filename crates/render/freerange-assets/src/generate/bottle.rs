@@ -25,7 +25,7 @@ struct BottleSize {
     neck_height: f32,
     /// Radius halfway up the band, as a share of `r`.
     waist: f32,
-    labelled: bool,
+    labeled: bool,
     /// Heights between which a label lies, on the belly or at the shoulder.
     band: [f32; 2],
 }
@@ -37,9 +37,9 @@ impl BottleSize {
         let shoulder = s.range(0.08, 0.4);
         let neck_height = s.range(0.03, 0.3);
         let waist = if s.chance(0.35) { s.range(0.78, 0.97) } else { 1.0 };
-        let labelled = s.chance(0.75);
+        let labeled = s.chance(0.75);
         let band = [s.range(0.1, 0.4) * h, s.range(0.65, 0.95) * h];
-        Self { r, h, neck, shoulder, neck_height, waist, labelled, band }
+        Self { r, h, neck, shoulder, neck_height, waist, labeled, band }
     }
 
     /// Height of the mouth.
@@ -52,7 +52,7 @@ pub fn bottle(a: &mut Assembly, s: &mut Style) {
     let scheme = s.scheme();
     let [body, cap] = bottle_materials(s, &scheme);
     let size = BottleSize::draw(s);
-    let label = if size.labelled { bottle_label(s, &scheme, &body, &size) } else { body.clone() };
+    let label = if size.labeled { bottle_label(s, &scheme, &body, &size) } else { body.clone() };
     let [body, cap, label] = [body, cap, label].map(|m| a.material(m));
     let spans = bottle_outline(s, &size, body, label);
     let (part, oval) = bottle_body(s, &size, &spans);

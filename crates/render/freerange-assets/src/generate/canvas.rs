@@ -5,11 +5,11 @@ use glam::Vec3;
 
 use crate::mesh::{Raster, linear_to_srgb};
 
-/// An sRGB-encoded colour, 0 to 255 per channel. Shapes are blended in this space: encoding each pixel would cost
+/// An sRGB-encoded color, 0 to 255 per channel. Shapes are blended in this space: encoding each pixel would cost
 /// more than drawing it.
 pub type Ink = Vec3;
 
-/// Encodes a linear colour.
+/// Encodes a linear color.
 pub fn ink(linear: Vec3) -> Ink {
     255.0 * Vec3::new(linear_to_srgb(linear.x), linear_to_srgb(linear.y), linear_to_srgb(linear.z))
 }
@@ -35,7 +35,7 @@ impl Canvas {
         Raster::from_encoded(self.width, self.height, self.pixels)
     }
 
-    /// Blends `f(pixel centre) = (colour, coverage)` over the pixels of the box.
+    /// Blends `f(pixel center) = (color, coverage)` over the pixels of the box.
     pub fn paint(&mut self, lo: Vec2, hi: Vec2, mut f: impl FnMut(Vec2) -> (Ink, f32)) {
         let [x0, x1] = range(lo.x, hi.x, self.width);
         let [y0, y1] = range(lo.y, hi.y, self.height);

@@ -145,7 +145,7 @@ fn bands(c: &mut Canvas, rng: &mut impl Rng, inks: [Ink; 2]) {
     }
 }
 
-/// A circle divided like a pie, for plates: petals and rings about the centre of a square raster.
+/// A circle divided like a pie, for plates: petals and rings about the center of a square raster.
 pub fn rosette(rng: &mut impl Rng, ground: Vec3, colors: [Vec3; 2], side: usize) -> Raster {
     let mut c = Canvas::new(side, side, ink(ground));
     let (middle, r, inks) = (Vec2::splat(0.5 * side as f32), 0.5 * side as f32, colors.map(ink));

@@ -162,7 +162,7 @@ fn letter(c: char) -> Option<&'static Skeleton> {
 #[derive(Clone, Copy, Debug)]
 pub struct Setting {
     pub color: Ink,
-    /// An outline of this colour and width (in cap heights).
+    /// An outline of this color and width (in cap heights).
     pub outline: Option<(Ink, f32)>,
     /// How far the middle of the line rises above its ends, in cap heights.
     pub arch: f32,
@@ -174,7 +174,7 @@ impl Setting {
     }
 }
 
-/// Draws one line centred in a box, as large as fits. Returns the cap height in pixels.
+/// Draws one line centerd in a box, as large as fits. Returns the cap height in pixels.
 pub fn text(canvas: &mut Canvas, word: &str, font: &Font, set: &Setting, lo: Vec2, hi: Vec2) -> f32 {
     let pad = font.half + set.outline.map_or(0.0, |o| o.1);
     let width = font.width(word) + 2.0 * pad + font.slant;

@@ -39,8 +39,8 @@ pub fn jar(a: &mut Assembly, s: &mut Style) {
     let w = walls(&side, wall, 0.0);
     // The label sits on the straight part.
     let (low, high) = (s.range(0.12, 0.25) * h, s.range(0.75, 0.92) * h);
-    let labelled = s.chance(0.65);
-    let label = if labelled { jar_label(s, &body, 1.15 * (high - low) / (TAU * r)) } else { body.clone() };
+    let labeled = s.chance(0.65);
+    let label = if labeled { jar_label(s, &body, 1.15 * (high - low) / (TAU * r)) } else { body.clone() };
     let cap = match s.count(0, 4) {
         0..2 => s.metal(),
         2 => {
@@ -61,7 +61,7 @@ pub fn jar(a: &mut Assembly, s: &mut Style) {
     let mut top = vec![Vec2::new(r, high)];
     top.extend(&w.outer[split..]);
     let band = vec![Vec2::new(r, low), Vec2::new(r, high)];
-    let relief = (!labelled && s.chance(0.4)).then(|| (Relief::random(s), 1, [low, high], s.range(0.006, 0.015)));
+    let relief = (!labeled && s.chance(0.4)).then(|| (Relief::random(s), 1, [low, high], s.range(0.006, 0.015)));
     let spans = [
         Span { points: bottom, material: body },
         Span { points: band, material: label },

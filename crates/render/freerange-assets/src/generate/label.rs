@@ -1,4 +1,4 @@
-//! Printed packaging: the faces of one product share its colours, brand, title and picture.
+//! Printed packaging: the faces of one product share its colors, brand, title and picture.
 
 use std::f32::consts::TAU;
 
@@ -12,7 +12,7 @@ use crate::generate::motif::{Logo, Motif};
 use crate::generate::palette::{self, Tone};
 use crate::mesh::Raster;
 
-/// The colours of one product, shared by all its faces; linear.
+/// The colors of one product, shared by all its faces; linear.
 #[derive(Clone, Debug)]
 pub struct Scheme {
     pub ground: Vec3,
@@ -49,15 +49,15 @@ pub enum Face {
     Front,
     /// Small print, a table, a bar code.
     Back,
-    /// A title on the ground colour.
+    /// A title on the ground color.
     Side,
     /// A label around a body: fronts and a back next to each other.
     Wrap,
-    /// The body's colour with one label on the front and one on the back.
+    /// The body's color with one label on the front and one on the back.
     Sticker,
 }
 
-/// Colours encoded for drawing.
+/// Colors encoded for drawing.
 struct Inks {
     ground: Ink,
     second: Ink,
@@ -71,7 +71,7 @@ struct Inks {
 #[derive(Clone, Copy, Debug)]
 enum Ground {
     Plain,
-    /// Two colours with a border at this height, its wave and its phase.
+    /// Two colors with a border at this height, its wave and its phase.
     Split(f32, f32, f32),
     Slanted(f32),
     Gradient,
@@ -261,7 +261,7 @@ impl Product {
         glyph::text(c, "NET WT 12 5", &self.fonts[1].light(), &set, at(0.1, 0.94), at(0.6, 0.985));
     }
 
-    /// A colour that reads on `ground`.
+    /// A color that reads on `ground`.
     fn on(&self, ground: Ink) -> Ink {
         let far = |c: Ink| (c - ground).length();
         [self.inks.ink, self.inks.paper, self.inks.dark]

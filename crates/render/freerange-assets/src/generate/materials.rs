@@ -133,7 +133,7 @@ impl Style<'_> {
     /// Puts dirt, dust and scratches on some share of materials.
     pub fn worn(&mut self, mut material: Material, share: f64) -> Material {
         if self.chance(share) {
-            let tone = if self.chance(0.7) { Tone::Brown } else { Tone::Grey };
+            let tone = if self.chance(0.7) { Tone::Brown } else { Tone::Gray };
             let dirt = self.tone(tone) * self.range(0.2, 0.8);
             let amounts =
                 Vec3::new(self.range(0.0, 0.5), self.range(0.0, 0.6), if self.chance(0.4) { 0.6 } else { 0.0 });

@@ -1,4 +1,4 @@
-//! The generator: picks a family, builds its parts, turns and normalises the result.
+//! The generator: picks a family, builds its parts, turns and normalizes the result.
 
 use std::f32::consts::{FRAC_PI_2, PI, TAU};
 
@@ -62,7 +62,7 @@ pub fn generate(seed: u64, config: &GeneratorConfig) -> Result<Mesh, Invalid> {
     Ok(mesh)
 }
 
-/// Puts its mean colour in the place of a print.
+/// Puts its mean color in the place of a print.
 fn unprint(texture: &mut Texture) {
     match texture {
         Texture::Print(raster) => *texture = Texture::Flat(raster.mean()),
@@ -115,7 +115,7 @@ pub fn random_rotation(s: &mut Style) -> Quat {
     Quat::from_axis_angle(axis, s.range(0.0, TAU))
 }
 
-/// Primitives that overlap: each new one is centred near the surface of an earlier one.
+/// Primitives that overlap: each new one is centerd near the surface of an earlier one.
 fn composition(a: &mut Assembly, s: &mut Style) {
     let parts = 2 + (s.range(0.0, 1.0).powi(2) * 6.0) as usize;
     for i in 0..parts {
@@ -132,7 +132,7 @@ fn composition(a: &mut Assembly, s: &mut Style) {
         let turn = if s.chance(0.6) { Quat::from_rotation_z(s.range(0.0, TAU)) } else { random_rotation(s) };
         part = part.transformed(Affine3A::from_scale_rotation_translation(size * stretch, turn, Vec3::ZERO));
         if i > 0 {
-            // A point between the new part's centre and its surface meets a point of the old surface.
+            // A point between the new part's center and its surface meets a point of the old surface.
             let own = part.positions[s.count(0, part.positions.len())] * s.range(0.3, 1.0);
             part = part.moved(anchor(a, s) - own);
         }

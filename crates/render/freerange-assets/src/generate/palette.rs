@@ -1,23 +1,23 @@
-//! Colours of household things, in linear light.
+//! Colors of household things, in linear light.
 
 use glam::Vec3;
 use rand::Rng;
 
 use crate::mesh::srgb_to_linear;
 
-/// Families of colours.
+/// Families of colors.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Tone {
     White,
     Saturated,
     Pastel,
     Dark,
-    Grey,
+    Gray,
     Brown,
     Any,
 }
 
-/// Linear colour from sRGB-encoded hue (turns), saturation and value.
+/// Linear color from sRGB-encoded hue (turns), saturation and value.
 pub fn hsv(h: f32, s: f32, v: f32) -> Vec3 {
     let f = |n: f32| {
         let k = (n + 6.0 * h.rem_euclid(1.0)) % 6.0;
@@ -48,7 +48,7 @@ pub fn color(rng: &mut impl Rng, tone: Tone) -> Vec3 {
         }
         Tone::Pastel => hsv(r.random(), r.random_range(0.12..0.45), r.random_range(0.75..0.98)),
         Tone::Dark => hsv(r.random(), r.random_range(0.0..0.4), r.random_range(0.06..0.3)),
-        Tone::Grey => hsv(r.random(), r.random_range(0.0..0.08), r.random_range(0.25..0.8)),
+        Tone::Gray => hsv(r.random(), r.random_range(0.0..0.08), r.random_range(0.25..0.8)),
         Tone::Brown => hsv(r.random_range(0.03..0.11), r.random_range(0.3..0.8), r.random_range(0.25..0.85)),
         Tone::Any => hsv(r.random(), r.random(), r.random_range(0.1..1.0)),
     }
@@ -63,20 +63,20 @@ pub fn tone(rng: &mut impl Rng, white_share: f32) -> Tone {
         0..42 => Tone::Saturated,
         42..56 => Tone::Pastel,
         56..70 => Tone::Dark,
-        70..80 => Tone::Grey,
+        70..80 => Tone::Gray,
         80..94 => Tone::Brown,
         _ => Tone::Any,
     }
 }
 
-/// The same colour a little lighter or darker, and slightly shifted.
+/// The same color a little lighter or darker, and slightly shifted.
 pub fn shade(rng: &mut impl Rng, c: Vec3, amount: f32) -> Vec3 {
     let gain = (rng.random_range(-amount..amount)).exp();
     let tint = Vec3::from_fn(|| rng.random_range(-0.15 * amount..0.15 * amount));
     (c * gain * (Vec3::ONE + tint)).clamp(Vec3::splat(0.003), Vec3::splat(0.98))
 }
 
-/// A colour that reads well on `ground`.
+/// A color that reads well on `ground`.
 pub fn contrast(rng: &mut impl Rng, ground: Vec3) -> Vec3 {
     let tones = if luminance(ground) > 0.3 {
         [Tone::Saturated, Tone::Dark, Tone::Dark, Tone::Brown]

@@ -135,7 +135,7 @@ impl Assembly {
         self.parts.iter().map(|(part, _)| part.triangles.len()).sum()
     }
 
-    /// Joins the parts into a normalised mesh, turned by `rotation`.
+    /// Joins the parts into a normalized mesh, turned by `rotation`.
     pub fn finish(self, rotation: Quat) -> Mesh {
         let mut mesh = Mesh { materials: self.materials, solid: true, ..Mesh::default() };
         for (part, crease) in &self.parts {

@@ -113,7 +113,7 @@ pub fn smooth(points: &[Vec2], steps: usize) -> Vec<Vec2> {
                     + (3.0 * p1 - p0 - 3.0 * p2 + p3) * t3),
             );
         }
-        // To the bit: neighbouring spans meet here.
+        // To the bit: neighboring spans meet here.
         out.push(p2);
     }
     out
@@ -235,7 +235,7 @@ pub fn superquadric(half: Vec3, e1: f32, e2: f32, resolution: usize, material: u
     let mut part = Part::default();
     part.grid([2 * resolution, resolution], [true, false], material, |u, v| {
         let (a, b) = (TAU * u, PI * (v - 0.5));
-        // Exactly zero at the poles, so that their triangles are recognised as degenerate.
+        // Exactly zero at the poles, so that their triangles are recognized as degenerate.
         let c = if v == 0.0 || v == 1.0 { 0.0 } else { b.cos() };
         half * Vec3::new(
             signed_power(c, e1) * signed_power(a.cos(), e2),

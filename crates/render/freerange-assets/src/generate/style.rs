@@ -61,7 +61,7 @@ impl<'a> Style<'a> {
         palette::color(&mut self.rng, tone)
     }
 
-    /// A material of one colour with the usual random finish.
+    /// A material of one color with the usual random finish.
     pub fn plain(&mut self, color: Vec3) -> Material {
         self.finish(Texture::Flat(color))
     }
@@ -96,7 +96,7 @@ impl<'a> Style<'a> {
         }
     }
 
-    /// A colour to go with `a`: a shade of it, a contrast, or anything.
+    /// A color to go with `a`: a shade of it, a contrast, or anything.
     pub fn partner(&mut self, a: Vec3) -> Vec3 {
         match self.count(0, 10) {
             0..4 => palette::shade(&mut self.rng, a, 0.8),
@@ -115,7 +115,7 @@ impl<'a> Style<'a> {
         }
     }
 
-    /// A patterned texture on the ground colour `a`.
+    /// A patterned texture on the ground color `a`.
     pub fn pattern(&mut self, a: Vec3) -> Texture {
         let b = self.partner(a);
         let seed = self.rng.random();
@@ -199,7 +199,7 @@ impl<'a> Style<'a> {
         }
     }
 
-    /// Ornaments or a label on the ground colour `a`.
+    /// Ornaments or a label on the ground color `a`.
     fn drawing(&mut self, a: Vec3) -> Texture {
         let scheme = Scheme { ground: a, ..self.scheme() };
         let (w, h) = (self.count(128, 320), self.count(128, 256));
@@ -248,7 +248,7 @@ impl<'a> Style<'a> {
         Product::random(&mut self.rng, scheme)
     }
 
-    /// Painted decoration on a ground colour, for a surface of that size (as in [`Style::print`]).
+    /// Painted decoration on a ground color, for a surface of that size (as in [`Style::print`]).
     pub fn decor(&mut self, ground: Vec3, size: Vec2) -> Material {
         let colors = [palette::contrast(&mut self.rng, ground), self.partner(ground)];
         let pixels = (512.0 * size).clamp(Vec2::splat(24.0), Vec2::splat(640.0));

@@ -21,14 +21,14 @@ pub enum AlphaMode {
     Blend,
 }
 
-/// How a surface reflects light: a coloured base under a clear specular layer, or a metal.
+/// How a surface reflects light: a colored base under a clear specular layer, or a metal.
 #[derive(Clone, Debug)]
 pub struct Material {
-    /// Base colour.
+    /// Base color.
     pub texture: Texture,
-    /// Multiplied onto the base colour and its alpha; linear.
+    /// Multiplied onto the base color and its alpha; linear.
     pub factor: Vec4,
-    /// What the alpha of the base colour means.
+    /// What the alpha of the base color means.
     pub alpha: AlphaMode,
     /// Amplitude of a slow brightness variation over the surface, 0 for none.
     pub variation: f32,
@@ -38,7 +38,7 @@ pub struct Material {
     pub specular: f32,
     /// Roughness of the reflection, 0.1 (polished) to 1 (matt).
     pub roughness: f32,
-    /// 1 for metals: the base colour tints the reflection and nothing is diffuse.
+    /// 1 for metals: the base color tints the reflection and nothing is diffuse.
     pub metallic: f32,
     /// Linear values multiplied onto roughness (green) and metallic (blue), as in glTF.
     pub metallic_roughness: Option<Map>,
@@ -46,9 +46,9 @@ pub struct Material {
     pub normal_map: Option<(Map, f32)>,
     /// Light that the surface gives off; linear radiance.
     pub emission: Vec3,
-    /// Colours multiplied onto `emission`.
+    /// Colors multiplied onto `emission`.
     pub emission_map: Option<Map>,
-    /// Shows its base colour as it is, whatever the light.
+    /// Shows its base color as it is, whatever the light.
     pub unlit: bool,
 }
 
@@ -79,12 +79,12 @@ impl Material {
         Self { texture, ..Self::default() }
     }
 
-    /// Linear base colour at rest position `p` and surface coordinates `uv`, within [0, 1].
+    /// Linear base color at rest position `p` and surface coordinates `uv`, within [0, 1].
     pub fn albedo(&self, p: Vec3, uv: Vec2) -> Vec3 {
         self.rgba(p, uv, Vec4::ONE, 0.0).truncate()
     }
 
-    /// Linear base colour and alpha at rest position `p` and surface coordinates `uv`, times `tint`, within [0, 1].
+    /// Linear base color and alpha at rest position `p` and surface coordinates `uv`, times `tint`, within [0, 1].
     /// Pictures are averaged over about the length `footprint` in (u, v).
     pub fn rgba(&self, p: Vec3, uv: Vec2, tint: Vec4, footprint: f32) -> Vec4 {
         let mut color = self.texture.rgba(p, uv, footprint) * self.factor * tint;

@@ -1,4 +1,4 @@
-//! Textured triangle meshes: files in ([`load_mesh`]), materials and the textures that colour them.
+//! Textured triangle meshes: files in ([`load_mesh`]), materials and the textures that color them.
 //!
 //! What is drawn of a mesh is `render`'s, where meshes come from without files `generate`'s.
 

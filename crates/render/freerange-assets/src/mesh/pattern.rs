@@ -27,21 +27,21 @@ impl Frame {
     }
 }
 
-/// What the pattern is. Colours are linear.
+/// What the pattern is. Colors are linear.
 #[derive(Clone, Debug)]
-#[allow(missing_docs, reason = "colours and sizes of what the line above each names")]
+#[allow(missing_docs, reason = "colors and sizes of what the line above each names")]
 pub enum Form {
     /// Strands over and under each other: `float` strands are passed at a time (1 is plain weave, 2 twill).
     Weave { warp: Vec3, weft: Vec3, gap: Vec3, float: i32, thin: f32 },
-    /// Columns of V-shaped stitches; rows of colours `a` and `b` as the hash says.
+    /// Columns of V-shaped stitches; rows of colors `a` and `b` as the hash says.
     Knit { a: Vec3, b: Vec3, share: f32 },
-    /// Crossing bands of up to three colours with a twill hatch.
+    /// Crossing bands of up to three colors with a twill hatch.
     Plaid { colors: [Vec3; 3], hatch: f32 },
     /// Zigzag rows.
     Chevron { a: Vec3, b: Vec3, steep: f32 },
     /// Fine streaks along the first coordinate.
     Brushed { a: Vec3, b: Vec3 },
-    /// Rings about z, coloured by turns, with thin lines between.
+    /// Rings about z, colored by turns, with thin lines between.
     Rings { colors: [Vec3; 3], stops: [f32; 3] },
     /// Chips of stone in a ground; cells per unit.
     Terrazzo { ground: Vec3, chips: [Vec3; 3], scale: f32 },
@@ -132,7 +132,7 @@ fn terrazzo(p: Vec3, ground: Vec3, chips: [Vec3; 3], scale: f32, seed: u32) -> V
 }
 
 impl Pattern {
-    /// Linear colour at rest position `p` and surface coordinates `uv`.
+    /// Linear color at rest position `p` and surface coordinates `uv`.
     pub fn color(&self, p: Vec3, uv: Vec2) -> Vec3 {
         let seed = self.seed;
         let q = self.frame.coordinates(p, uv);

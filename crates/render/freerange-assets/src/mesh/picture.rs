@@ -18,7 +18,7 @@ pub enum Wrap {
     Repeat,
     /// The picture mirrored.
     Mirror,
-    /// The colour of the border.
+    /// The color of the border.
     Clamp,
 }
 
@@ -53,7 +53,7 @@ pub struct Picture {
 }
 
 impl Picture {
-    /// Makes the smaller copies, each half as wide and high. Colours are averaged in linear light, and those of an
+    /// Makes the smaller copies, each half as wide and high. Colors are averaged in linear light, and those of an
     /// `srgb` picture by the weight of their alpha. Without `srgb` the values are data, taken as linear. An empty
     /// image becomes one white pixel.
     pub fn new(image: RgbaImage, srgb: bool) -> Self {
@@ -86,7 +86,7 @@ impl Picture {
         &self.levels[0].pixels
     }
 
-    /// Whether the colours are sRGB-encoded.
+    /// Whether the colors are sRGB-encoded.
     pub fn is_srgb(&self) -> bool {
         self.srgb
     }
@@ -96,7 +96,7 @@ impl Picture {
         self.pixels().iter().any(|p| p[3] != 255)
     }
 
-    /// Linear colour and alpha at `uv`, where (0, 0) is the upper left corner of the picture and (1, 1) the lower
+    /// Linear color and alpha at `uv`, where (0, 0) is the upper left corner of the picture and (1, 1) the lower
     /// right, averaged over about `footprint` pixels of the full picture along each axis: the two nearest of the
     /// smaller copies, each bilinear, are blended.
     pub fn sample(&self, uv: Vec2, footprint: f32, wrap: [Wrap; 2]) -> Vec4 {
@@ -201,7 +201,7 @@ impl Map {
         Self { picture, transform: Affine2::IDENTITY, wrap: [Wrap::Repeat; 2] }
     }
 
-    /// Linear colour and alpha at the mesh's `uv`, averaged over about the length `footprint` in (u, v).
+    /// Linear color and alpha at the mesh's `uv`, averaged over about the length `footprint` in (u, v).
     pub fn sample(&self, uv: Vec2, footprint: f32) -> Vec4 {
         let (w, h) = (self.picture.width() as f32, self.picture.height() as f32);
         let scale = (self.transform.matrix2.determinant().abs() * w * h).sqrt();

@@ -17,7 +17,7 @@ pub struct Raster {
 }
 
 impl Raster {
-    /// A picture of one colour (linear). Sides of zero become one.
+    /// A picture of one color (linear). Sides of zero become one.
     pub fn new(width: usize, height: usize, fill: Vec3) -> Self {
         let (width, height) = (width.max(1), height.max(1));
         Self { width, height, pixels: vec![encode(fill); width * height] }
@@ -39,14 +39,14 @@ impl Raster {
         self.height
     }
 
-    /// Sets a pixel to a linear colour; ignores points outside.
+    /// Sets a pixel to a linear color; ignores points outside.
     pub fn set(&mut self, x: i32, y: i32, color: Vec3) {
         if x >= 0 && y >= 0 && (x as usize) < self.width && (y as usize) < self.height {
             self.pixels[y as usize * self.width + x as usize] = encode(color);
         }
     }
 
-    /// Mean colour, linear.
+    /// Mean color, linear.
     pub fn mean(&self) -> Vec3 {
         let decode = |e: u8| f64::from(DECODE[e as usize]);
         let sum: glam::DVec3 =

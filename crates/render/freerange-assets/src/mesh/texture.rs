@@ -9,24 +9,24 @@ use crate::mesh::pattern::Pattern;
 use crate::mesh::picture::Map;
 use crate::mesh::raster::Raster;
 
-/// A texture: linear colour as a function of the rest position `p` (within the sphere of radius 0.5) and of (u, v).
-/// Colours are linear and within [0, 1].
+/// A texture: linear color as a function of the rest position `p` (within the sphere of radius 0.5) and of (u, v).
+/// Colors are linear and within [0, 1].
 #[derive(Clone, Debug)]
 pub enum Texture {
-    /// One colour.
+    /// One color.
     Flat(Vec3),
     /// From `a` to `b` along `direction`, between the projections `range[0]` and `range[1]`.
     Gradient {
-        /// Start colour.
+        /// Start color.
         a: Vec3,
-        /// End colour.
+        /// End color.
         b: Vec3,
         /// Unit direction.
         direction: Vec3,
         /// Projections where it starts and ends.
         range: [f32; 2],
     },
-    /// Alternating stripes across `direction`; the share `duty` of each period has colour `b`.
+    /// Alternating stripes across `direction`; the share `duty` of each period has color `b`.
     Stripes {
         /// Ground.
         a: Vec3,
@@ -43,23 +43,23 @@ pub enum Texture {
     },
     /// A solid checkerboard with `scale` cells per unit.
     Checker {
-        /// First colour.
+        /// First color.
         a: Vec3,
-        /// Second colour.
+        /// Second color.
         b: Vec3,
         /// Cells per unit along each axis.
         scale: Vec3,
     },
     /// A checkerboard in (u, v).
     CheckerUv {
-        /// First colour.
+        /// First color.
         a: Vec3,
-        /// Second colour.
+        /// Second color.
         b: Vec3,
         /// Cells along u and v.
         cells: Vec2,
     },
-    /// Jittered balls of one colour in another.
+    /// Jittered balls of one color in another.
     Dots {
         /// Ground.
         a: Vec3,
@@ -72,11 +72,11 @@ pub enum Texture {
         /// Noise seed.
         seed: u32,
     },
-    /// Fractal noise between two colours.
+    /// Fractal noise between two colors.
     Noise {
-        /// Colour of low values.
+        /// Color of low values.
         a: Vec3,
-        /// Colour of high values.
+        /// Color of high values.
         b: Vec3,
         /// Features per unit, per axis.
         scale: Vec3,
@@ -117,13 +117,13 @@ pub enum Texture {
         /// Noise seed.
         seed: u32,
     },
-    /// Cells with colours between `a` and `b` and seams of colour `edge`.
+    /// Cells with colors between `a` and `b` and seams of color `edge`.
     Voronoi {
-        /// Colour range of the cells.
+        /// Color range of the cells.
         a: Vec3,
-        /// Colour range of the cells.
+        /// Color range of the cells.
         b: Vec3,
-        /// Seam colour.
+        /// Seam color.
         edge: Vec3,
         /// Cells per unit.
         scale: f32,
@@ -132,13 +132,13 @@ pub enum Texture {
         /// Noise seed.
         seed: u32,
     },
-    /// Bands along a direction: colour `colors[i]` up to the projection `stops[i]`, the last colour above.
+    /// Bands along a direction: color `colors[i]` up to the projection `stops[i]`, the last color above.
     Bands {
         /// Unit direction.
         direction: Vec3,
-        /// Ascending projections, one fewer than colours.
+        /// Ascending projections, one fewer than colors.
         stops: Vec<f32>,
-        /// Colours, at least one.
+        /// Colors, at least one.
         colors: Vec<Vec3>,
     },
     /// A picture over (u, v).
@@ -172,7 +172,7 @@ fn smoothstep(lo: f32, hi: f32, x: f32) -> f32 {
 }
 
 impl Texture {
-    /// Linear colour and alpha at rest position `p` and surface coordinates `uv`. Pictures from files are averaged over
+    /// Linear color and alpha at rest position `p` and surface coordinates `uv`. Pictures from files are averaged over
     /// about the length `footprint` in (u, v).
     pub fn rgba(&self, p: Vec3, uv: Vec2, footprint: f32) -> Vec4 {
         match self {
@@ -181,7 +181,7 @@ impl Texture {
         }
     }
 
-    /// Linear colour at rest position `p` and surface coordinates `uv`.
+    /// Linear color at rest position `p` and surface coordinates `uv`.
     pub fn color(&self, p: Vec3, uv: Vec2) -> Vec3 {
         match self {
             Self::Flat(color) => *color,
@@ -254,7 +254,7 @@ impl Texture {
 pub struct Wear {
     /// What is worn.
     pub base: Texture,
-    /// Colour of the dirt.
+    /// Color of the dirt.
     pub dirt: Vec3,
     /// Strength of stains, of the dirt near the foot, and of scratches, each 0 to 1.
     pub amounts: Vec3,
@@ -265,7 +265,7 @@ pub struct Wear {
 }
 
 impl Wear {
-    /// Linear colour at rest position `p` and surface coordinates `uv`.
+    /// Linear color at rest position `p` and surface coordinates `uv`.
     pub fn color(&self, p: Vec3, uv: Vec2) -> Vec3 {
         let base = self.base.color(p, uv);
         let stain = ((noise::fbm(p * self.scale, self.seed, 4) - 0.52) * 6.0).clamp(0.0, 1.0);

@@ -18,7 +18,7 @@ pub struct Mesh {
     /// Surface coordinates: for pictures from files v runs down and (0, 0) is the upper left, for printed textures
     /// v runs up and (0, 0) is the lower left. `[vertices]`
     pub uvs: Vec<Vec2>,
-    /// Linear colours and alphas, multiplied onto the base colour; may be empty for none. `[vertices]` or `[]`
+    /// Linear colors and alphas, multiplied onto the base color; may be empty for none. `[vertices]` or `[]`
     pub colors: Vec<Vec4>,
     /// Vertex indices. `[triangles]`
     pub triangles: Vec<[u32; 3]>,
@@ -99,7 +99,7 @@ impl Mesh {
         material.opacity(material.rgba(rest, uv, self.tint(corners, w), 0.0).w)
     }
 
-    /// The vertex colour at a point given by its weights; white without vertex colours.
+    /// The vertex color at a point given by its weights; white without vertex colors.
     pub fn tint(&self, corners: [usize; 3], weights: [f32; 3]) -> Vec4 {
         if self.colors.is_empty() {
             return Vec4::ONE;
@@ -114,7 +114,7 @@ impl Mesh {
         }
     }
 
-    /// Centres the bounding box at the origin and scales the farthest vertex to distance 0.5.
+    /// Centers the bounding box at the origin and scales the farthest vertex to distance 0.5.
     pub fn normalize(&mut self) {
         let (lo, hi) = self
             .positions

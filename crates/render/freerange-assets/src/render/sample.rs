@@ -13,7 +13,7 @@ pub struct SurfacePoint {
     pub position: [f32; 3],
     /// Unit outward shading normal.
     pub normal: [f32; 3],
-    /// Shaded colour averaged over viewing directions, sRGB-encoded, within [0, 1].
+    /// Shaded color averaged over viewing directions, sRGB-encoded, within [0, 1].
     pub color: [f32; 3],
     /// Area that the point stands for, in squared units.
     pub area: f32,

@@ -1,4 +1,4 @@
-//! The colour of surface points: their material under the baked light and the sun.
+//! The color of surface points: their material under the baked light and the sun.
 
 use std::f32::consts::PI;
 

@@ -161,7 +161,7 @@ impl<'a> Grid<'a> {
         Some(visible)
     }
 
-    /// The samples of each pixel, shaded: mean linear colour times opacity, and mean opacity. `[rows, columns]`
+    /// The samples of each pixel, shaded: mean linear color times opacity, and mean opacity. `[rows, columns]`
     /// of pixels
     fn shade(&self, scene: &Scene, visible: &[u32]) -> Vec<Vec4> {
         let n = self.per_axis as usize;
@@ -275,7 +275,7 @@ mod tests {
             let (a, b) = (grid.rasterize(&scene).unwrap(), grid.trace(&scene));
             let covered = b.iter().filter(|&&id| id != NOTHING).count();
             assert!(covered > 300, "seed {seed}: {covered}");
-            // Samples on an edge may choose either neighbour, and a silhouette either side.
+            // Samples on an edge may choose either neighbor, and a silhouette either side.
             let differ = a.iter().zip(&b).filter(|(a, b)| a != b).count();
             let holes = a.iter().zip(&b).filter(|&(&a, &b)| (a == NOTHING) != (b == NOTHING)).count();
             assert!(differ * 200 <= covered, "seed {seed}: {differ} of {covered} differ");

@@ -11,7 +11,7 @@ fn a_triangle_arrives_in_the_canonical_frame() {
     let loaded = Glb::triangle().load();
     let mesh = &loaded.mesh;
     assert_eq!(mesh.triangles.len(), 1);
-    // The box is (0..2, 0..2, 0), so its corners are sqrt(2) from the centre. (x, y, z) goes to (x, -z, y).
+    // The box is (0..2, 0..2, 0), so its corners are sqrt(2) from the center. (x, y, z) goes to (x, -z, y).
     let s = 0.5 / 2f32.sqrt();
     assert_close(mesh.positions[0], [-s, 0.0, -s]);
     assert_close(mesh.positions[1], [s, 0.0, -s]);
@@ -123,7 +123,7 @@ fn the_scene_chooses_the_nodes() {
 }
 
 #[test]
-fn vertex_colours_of_all_types() {
+fn vertex_colors_of_all_types() {
     let floats = |v: &[f32]| v.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>();
     let shorts = |v: &[u16]| v.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>();
     for (component, kind, bytes, stride) in [
@@ -146,7 +146,7 @@ fn vertex_colours_of_all_types() {
 }
 
 #[test]
-fn quantised_positions_are_scaled_by_the_node() {
+fn quantized_positions_are_scaled_by_the_node() {
     let mut glb = Glb::new();
     let values: Vec<u8> =
         [0i16, 0, 0, 0, 32767, 0, 0, 0, 0, -32767, 0, 0].iter().flat_map(|x| x.to_le_bytes()).collect();

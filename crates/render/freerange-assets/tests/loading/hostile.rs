@@ -204,7 +204,7 @@ fn positions_that_are_not_numbers_or_have_no_area() {
     glb.json["nodes"] = json!([]);
     assert_names(&glb.error(), &["triangles", "none"]);
     assert_names(&Glb::new().error(), &["triangles", "none"]);
-    // Broken normals and colours are only replaced.
+    // Broken normals and colors are only replaced.
     let mut glb = Glb::triangle();
     glb.attribute("NORMAL", "VEC3", &[f32::NAN; 9]);
     glb.attribute("COLOR_0", "VEC4", &[f32::INFINITY; 12]);
@@ -217,7 +217,7 @@ fn with_picture(picture: &[u8]) -> Glb {
     Glb::textured(json!({"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}), picture)
 }
 
-fn grey_png(width: u32, height: u32) -> Vec<u8> {
+fn gray_png(width: u32, height: u32) -> Vec<u8> {
     let mut bytes = std::io::Cursor::new(Vec::new());
     image::GrayImage::new(width, height).write_to(&mut bytes, ImageFormat::Png).unwrap();
     bytes.into_inner()
@@ -225,15 +225,15 @@ fn grey_png(width: u32, height: u32) -> Vec<u8> {
 
 #[test]
 fn pictures_that_are_too_large_or_broken() {
-    assert_names(&with_picture(&grey_png(20_000, 2)).error(), &["images[0]", "max_texture_side"]);
-    assert_names(&with_picture(&grey_png(2, 20_000)).error(), &["images[0]", "max_texture_side"]);
+    assert_names(&with_picture(&gray_png(20_000, 2)).error(), &["images[0]", "max_texture_side"]);
+    assert_names(&with_picture(&gray_png(2, 20_000)).error(), &["images[0]", "max_texture_side"]);
     // Few bytes, many pixels.
     let limits = LoadLimits { max_texture_pixels: 1_000_000, ..LoadLimits::default() };
-    let bomb = grey_png(4000, 4000);
+    let bomb = gray_png(4000, 4000);
     assert!(bomb.len() < 100_000);
     assert_names(&error_with(&with_picture(&bomb).bytes(), &limits), &["images[0]", "max_texture_pixels"]);
     // Many pictures share one limit; one picture under two names counts twice.
-    let mut glb = with_picture(&grey_png(800, 800));
+    let mut glb = with_picture(&gray_png(800, 800));
     glb.json["images"] = json!([glb.json["images"][0], glb.json["images"][0]]);
     glb.json["textures"] = json!([{"source": 0}, {"source": 1}]);
     glb.json["materials"][0]["emissiveTexture"] = json!({"index": 1});

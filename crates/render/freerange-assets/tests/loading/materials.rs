@@ -68,7 +68,7 @@ fn factors_alpha_and_wrap() {
     assert_eq!(m.emission, Vec3::new(0.0, 2.0, 4.0));
     assert_eq!(map(&m).wrap, [Wrap::Clamp, Wrap::Mirror]);
     assert!(m.emission_map.as_ref().unwrap().picture.is_srgb());
-    // Data, not colours, though it is the same image.
+    // Data, not colors, though it is the same image.
     assert!(!m.metallic_roughness.as_ref().unwrap().picture.is_srgb());
     let (normal, scale) = m.normal_map.as_ref().unwrap();
     assert!(!normal.picture.is_srgb() && *scale == 0.5);
@@ -115,7 +115,7 @@ fn texture_transforms_scale_then_turn_then_move() {
 }
 
 #[test]
-fn a_vertex_carries_the_coordinates_of_its_base_colour() {
+fn a_vertex_carries_the_coordinates_of_its_base_color() {
     let mut source = base();
     source["pbrMetallicRoughness"]["baseColorTexture"]["texCoord"] = json!(1);
     source["emissiveTexture"] = json!({"index": 0});

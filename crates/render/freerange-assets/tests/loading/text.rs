@@ -48,13 +48,13 @@ fn the_up_axis_can_be_chosen() {
 }
 
 #[test]
-fn obj_vertex_colours_are_srgb() {
+fn obj_vertex_colors_are_srgb() {
     let text = "v 0 0 0 0.5 1 0\nv 1 0 0 0.5 1 0\nv 0 1 0 0.5 1 0\nf 1 2 3\n";
     let loaded = load(MeshFormat::Obj, text.as_bytes());
     let want = Vec4::new(srgb_to_linear(0.5), 1.0, 0.0, 1.0);
     assert_eq!(loaded.mesh.colors, [want; 3]);
     let some = load(MeshFormat::Obj, text.replacen("v 1 0 0 0.5 1 0", "v 1 0 0", 1).as_bytes());
-    assert!(some.mesh.colors.is_empty() && some.notes[0].contains("vertex colours are ignored"));
+    assert!(some.mesh.colors.is_empty() && some.notes[0].contains("vertex colors are ignored"));
 }
 
 fn write_obj(folder: &Path, mtl: &str) -> Loaded {

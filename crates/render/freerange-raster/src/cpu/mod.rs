@@ -1,4 +1,4 @@
-//! The fast rasteriser for processors: no tensors, plain slices.
+//! The fast rasterizer for processors: no tensors, plain slices.
 //!
 //! Every view is prepared (projection, depth order), then drawn in bands of rows, then in blocks of 4 x 4 pixels, one
 //! vector lane per pixel; views and bands run in parallel on rayon's pool. Sums over pixels always run in the same
@@ -25,7 +25,7 @@ use tile::{Band, RowGrads, Rows, Scratch};
 /// What [`render`] returns. All arrays are row-major.
 #[derive(Debug)]
 pub struct RenderOutput {
-    /// Colour over the background, `[views, height, width, 3]`; not clamped.
+    /// Color over the background, `[views, height, width, 3]`; not clamped.
     pub rgb: Vec<f32>,
     /// 1 - transmittance, `[views, height, width]`.
     pub alpha: Vec<f32>,
@@ -45,11 +45,11 @@ pub struct Gradients {
 }
 
 /// Renders `gaussians` (row-major `[n, 14]`, channels as in [`crate`]) from every one of `cameras`, which share one image
-/// size, in front of one background colour per view.
+/// size, in front of one background color per view.
 ///
 /// Gaussians are culled where any channel is not finite, the quaternion is shorter than 1e-12, the camera z is outside
 /// [`RasterConfig::near`]..=[`RasterConfig::far`], the standard deviation in the image exceeds 10^6 pixels, the
-/// centre is more than 10^7 pixels away, or a colour channel exceeds 10^6. The result is finite.
+/// center is more than 10^7 pixels away, or a color channel exceeds 10^6. The result is finite.
 ///
 /// The output also holds what [`render_backward`] needs: about 64 bytes per Gaussian and view, and two bytes per
 /// Gaussian and block of 4 x 4 pixels that it reaches.

@@ -8,7 +8,7 @@ use freerange_scene::camera::Camera;
 
 /// A Gaussian seen by one camera, ready to be drawn.
 ///
-/// With `(dx, dy)` = pixel centre - mean, `u = l11 dx + l21 dy` and `v = l22 dy`, its opacity at the pixel is
+/// With `(dx, dy)` = pixel center - mean, `u = l11 dx + l21 dy` and `v = l22 dy`, its opacity at the pixel is
 /// `2^(log2_opacity - u^2 - v^2)`: the `l` are the Cholesky factor of the inverse covariance, in units that save a
 /// multiplication. A sum of squares cannot turn negative by rounding, unlike `a dx^2 + 2 b dx dy + c dy^2`.
 #[derive(Clone, Copy, Debug, Default)]
@@ -30,7 +30,7 @@ pub struct Splat {
     pub half_height: f32,
     /// dy of its rightmost point.
     pub dy_right: f32,
-    /// First and last row of pixel centres within it.
+    /// First and last row of pixel centers within it.
     pub rows: [u16; 2],
     /// Index of the Gaussian.
     pub index: u32,
@@ -43,7 +43,7 @@ pub struct Pinhole {
     pub translation: [f32; 3],
     pub focal: [f32; 2],
     pub center: [f32; 2],
-    /// Range of x/z and y/z within which the projection is linearised where the Gaussian is; beyond, at the end.
+    /// Range of x/z and y/z within which the projection is linearized where the Gaussian is; beyond, at the end.
     pub low: [f32; 2],
     pub high: [f32; 2],
 }
@@ -69,7 +69,7 @@ impl Pinhole {
 const MAX_COVARIANCE: f32 = 1e12;
 /// So are those whose mean lies ten million pixels away.
 const MAX_COORDINATE: f32 = 1e7;
-/// And those with a colour beyond a million: their neighbours' gradients would overflow.
+/// And those with a color beyond a million: their neighbors' gradients would overflow.
 const MAX_COLOR: f32 = 1e6;
 /// log2(255): a splat of this many halvings below full opacity is invisible.
 pub const LOG2_255: f32 = 7.994_353_3;
@@ -228,7 +228,7 @@ pub fn project<const FMA: bool>(
         o[10][l] = half_extent_x * xy / xx;
         o[11][l] = v.mean[0] - half_extent_x;
         o[12][l] = v.mean[0] + half_extent_x;
-        // Rows of pixel centres, with a hundredth of a pixel to spare, so that rounding cannot lose one: the kernel
+        // Rows of pixel centers, with a hundredth of a pixel to spare, so that rounding cannot lose one: the kernel
         // tests every pixel anyway.
         let top = max(v.mean[1] - o[9][l] + 0.49, 0.0);
         let bottom = min(v.mean[1] + o[9][l] - 0.49, size[1] as f32 - 1.0);
@@ -279,8 +279,8 @@ pub fn project<const FMA: bool>(
 
 /// Sums over the pixels of one view, for one Gaussian, of `g` = d loss / d ln(alpha) and of the blending weights.
 ///
-/// In this order: `g`, `g dx`, `g dy`, `g dx^2`, `g dx dy`, `g dy^2` with `(dx, dy)` = pixel centre - mean;
-/// d loss / d colour (3); d loss / d depth; two zeros.
+/// In this order: `g`, `g dx`, `g dy`, `g dx^2`, `g dx dy`, `g dy^2` with `(dx, dy)` = pixel center - mean;
+/// d loss / d color (3); d loss / d depth; two zeros.
 pub const SUMS: usize = 12;
 
 /// Pulls the pixel sums of all `views` back to the channels of the Gaussians `rows` (`[<= LANES, 14]`, the first has

@@ -16,7 +16,7 @@ const CHECK: usize = 8;
 
 type Pixels = [f32; LANES];
 
-/// Pixel centre of each lane, from the corner of its block.
+/// Pixel center of each lane, from the corner of its block.
 const X: Pixels = lanes(0, 0.5);
 const Y: Pixels = lanes(1, 0.5);
 
@@ -219,7 +219,7 @@ pub fn backward<const FMA: bool, const DEPTH: bool>(
         let (x0, y0) = (i % across * BLOCK[0], i / across * BLOCK[1]);
         let mut t = [0f32; LANES];
         let mut d = [[0f32; LANES]; 4]; // d loss / d (red, green, blue, depth)
-        let mut behind = [0f32; LANES]; // the colour seen behind the last splat, times d loss / d colour
+        let mut behind = [0f32; LANES]; // the color seen behind the last splat, times d loss / d color
         each_inside(x0, y0, grads.width, grads.height, |l, pixel| {
             t[l] = 1.0;
             for c in 0..3 {
@@ -293,9 +293,9 @@ fn near_to_far<const FMA: bool>(
     t_final
 }
 
-/// Replaces the alphas by d loss / d ln(alpha) = weight (colour - colour behind), where colours are times
-/// d loss / d colour. What is seen in front of a splat follows from what is seen behind it:
-/// behind += alpha (colour - behind).
+/// Replaces the alphas by d loss / d ln(alpha) = weight (color - color behind), where colors are times
+/// d loss / d color. What is seen in front of a splat follows from what is seen behind it:
+/// behind += alpha (color - behind).
 #[inline(always)]
 fn far_to_near<const FMA: bool, const DEPTH: bool>(
     band: &Band,

@@ -81,7 +81,7 @@ pub fn backward<A: Accumulator>(
         let mut t = 0.0f32;
         let mut last = 0u32;
         let mut d = vec3(0.0f32, 0.0f32, 0.0f32);
-        // The colour seen behind the last splat, times d loss / d colour.
+        // The color seen behind the last splat, times d loss / d color.
         let mut behind = 0.0f32;
         if at.inside {
             let pixel = frame.first as usize * (frame.height * frame.width) as usize + at.pixel;

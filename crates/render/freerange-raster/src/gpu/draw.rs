@@ -29,7 +29,7 @@ pub struct Pixel {
     /// The corner of the tile.
     pub corner_x: u32,
     pub corner_y: u32,
-    /// The pixel's centre.
+    /// The pixel's center.
     pub x: f32,
     pub y: f32,
 }

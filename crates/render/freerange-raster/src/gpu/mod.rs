@@ -1,4 +1,4 @@
-//! The rasteriser as kernels for GPUs, through CubeCL. All images of all objects are drawn by one launch of each kernel:
+//! The rasterizer as kernels for GPUs, through CubeCL. All images of all objects are drawn by one launch of each kernel:
 //!
 //! 1. `project`: splats and their depth, one thread per Gaussian and image.
 //! 2. `sort_blocks`, `rank_and_mark`: the depth order of each image, and for each tile of 16 x 16 pixels one bit per
@@ -81,7 +81,7 @@ impl<'a> Plan<'a> {
         let client = gaussians.client.clone();
         let properties = client.properties();
         let most = properties.hardware.max_units_per_cube as usize;
-        assert!(most >= THREADS, "the device runs {most} units per cube, the rasteriser needs {THREADS}");
+        assert!(most >= THREADS, "the device runs {most} units per cube, the rasterizer needs {THREADS}");
         let n = gaussians.meta.shape()[1];
         let tiles_across = job.width.div_ceil(TILE);
         let (tiles, words) = (tiles_across * job.height.div_ceil(TILE), n.div_ceil(32));

@@ -129,7 +129,7 @@ pub fn rank_and_mark(
     }
 }
 
-/// The pixel centres of a tile are from 0.5 to 15.5 beyond its corner.
+/// The pixel centers of a tile are from 0.5 to 15.5 beyond its corner.
 const FIRST: f32 = 0.5;
 const LAST: f32 = TILE as f32 - 0.5;
 
@@ -184,14 +184,14 @@ fn edge(extreme: f32, low: f32, high: f32, half_width: f32, half_height: f32, sl
     slope * dy + half_width * max(1.0f32 - v * v, 0.0f32).sqrt()
 }
 
-/// The first row or column of tiles with a pixel centre at or beyond `at`.
+/// The first row or column of tiles with a pixel center at or beyond `at`.
 #[cube]
 fn first_tile(at: f32) -> u32 {
     // Bounded before the conversion, which has no meaning for what is too large.
     u32::cast_from(clamp(((at - LAST) / TILE as f32).ceil(), 0.0f32, 1e6f32))
 }
 
-/// One beyond the last row or column of tiles, of `count`, with a pixel centre at or before `at`.
+/// One beyond the last row or column of tiles, of `count`, with a pixel center at or before `at`.
 #[cube]
 fn end_tile(at: f32, count: u32) -> u32 {
     u32::cast_from(clamp(((at - FIRST) / TILE as f32).floor() + 1.0f32, 0.0f32, f32::cast_from(count)))

@@ -12,7 +12,7 @@ use freerange_scene::camera::Camera;
 pub const CAMERA: usize = 24;
 /// [`F4`]s per splat: `(x, y, l11, l21)`, `(l22, ln opacity, red, green)`, `(blue, -, -, -)`.
 ///
-/// With `(dx, dy)` = pixel centre - mean, `u = l11 dx + l21 dy` and `v = l22 dy`, the opacity at the pixel is
+/// With `(dx, dy)` = pixel center - mean, `u = l11 dx + l21 dy` and `v = l22 dy`, the opacity at the pixel is
 /// `exp(ln opacity - u^2 - v^2)`.
 pub const RECORD: usize = 3;
 /// Sort key of a splat that is not drawn. Keys of others are the bits of their depth, which order as the floats do.
@@ -20,7 +20,7 @@ pub const CULLED: u32 = u32::MAX;
 /// ln(255): a splat whose logarithm of the opacity is below minus this is invisible.
 pub const LN_255: f32 = 5.541_263_5;
 /// Sums over the pixels of one image, for one Gaussian: with `g` = d loss / d ln(alpha), these are `g`, `g dx`, `g dy`,
-/// `g dx^2`, `g dx dy`, `g dy^2`, d loss / d colour (3).
+/// `g dx^2`, `g dx dy`, `g dy^2`, d loss / d color (3).
 pub const SUMS: usize = 9;
 
 const MAX_COVARIANCE: f32 = 1e12;
@@ -28,7 +28,7 @@ const MAX_COORDINATE: f32 = 1e7;
 const MAX_COLOR: f32 = 1e6;
 
 /// What kernels read of a camera: rotation (rows), translation, focal lengths, principal point, the range of x/z and y/z
-/// where the projection is linearised (low x, low y, high x, high y), background, one unused.
+/// where the projection is linearized (low x, low y, high x, high y), background, one unused.
 pub fn camera_floats(camera: &Camera, background: [f32; 3]) -> [f32; CAMERA] {
     let pinhole = crate::cpu::project::Pinhole::new(camera);
     let mut out = [0.0; CAMERA];

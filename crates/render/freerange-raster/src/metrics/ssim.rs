@@ -11,7 +11,7 @@ use multiversion::{multiversion, target::target_cfg_f};
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Taps of the window on each side of its centre.
+/// Taps of the window on each side of its center.
 pub(crate) const RADIUS: usize = 5;
 /// Width of the window.
 pub(crate) const TAPS: usize = 2 * RADIUS + 1;

@@ -25,7 +25,7 @@ pub fn scene(seed: u64, n: usize) -> Vec<f32> {
     rows
 }
 
-/// A camera 1.5 from the origin, turned by `turn` radians around it, whose principal point is off centre.
+/// A camera 1.5 from the origin, turned by `turn` radians around it, whose principal point is off center.
 pub fn camera(turn: f64, width: u32, height: u32) -> Camera {
     let eye = DVec3::new(-1.5 * turn.cos(), -1.5 * turn.sin(), 0.0);
     let camera = Camera::look_at(eye, DVec3::ZERO, DVec3::Z, 0.855, width, height);

@@ -99,41 +99,41 @@ pub fn canonical_from_user(views: &[View], config: &FrameConfig) -> Result<Canon
 
     let axes: Vec<(DVec3, DVec3)> = views.iter().map(optical_axis).collect();
     let masked = silhouettes.len() >= 2;
-    let (centre, radius) = match (config.center, config.radius) {
-        (Some(centre), Some(radius)) => (centre, radius),
-        (Some(centre), None) if masked => (centre, silhouettes.iter().map(|s| s.radius(centre)).fold(0.0, f64::max)),
+    let (center, radius) = match (config.center, config.radius) {
+        (Some(center), Some(radius)) => (center, radius),
+        (Some(center), None) if masked => (center, silhouettes.iter().map(|s| s.radius(center)).fold(0.0, f64::max)),
         (None, radius) if masked => {
             let lines: Vec<(DVec3, DVec3)> = silhouettes.iter().map(|s| (s.origin, s.towards)).collect();
-            let (centre, found) = from_silhouettes(&silhouettes, nearest_point(&lines)?)?;
-            (centre, radius.unwrap_or(found))
+            let (center, found) = from_silhouettes(&silhouettes, nearest_point(&lines)?)?;
+            (center, radius.unwrap_or(found))
         }
-        (centre, radius) => {
-            let centre = centre.map_or_else(|| nearest_point(&axes), Ok)?;
-            let mean = axes.iter().map(|(o, _)| o.distance(centre)).sum::<f64>() / axes.len() as f64;
+        (center, radius) => {
+            let center = center.map_or_else(|| nearest_point(&axes), Ok)?;
+            let mean = axes.iter().map(|(o, _)| o.distance(center)).sum::<f64>() / axes.len() as f64;
             if radius.is_none() {
                 notes.push("no masks: the object's size is taken from the cameras' distance".into());
             }
-            (centre, radius.unwrap_or(mean * CANONICAL_RADIUS / CANONICAL_DISTANCE))
+            (center, radius.unwrap_or(mean * CANONICAL_RADIUS / CANONICAL_DISTANCE))
         }
     };
     let scale = CANONICAL_RADIUS / radius;
-    let translation = -scale * (rotation * centre);
+    let translation = -scale * (rotation * center);
     let sound = scale > 0.0 && scale.is_finite() && translation.is_finite();
     if !sound {
-        return Err(CameraError::Frame(format!("an object of radius {radius} at {centre}")));
+        return Err(CameraError::Frame(format!("an object of radius {radius} at {center}")));
     }
     let rounded = |v: f64| (v * 1e4).round() / 1e4;
-    let (x, y, z) = (rounded(centre.x), rounded(centre.y), rounded(centre.z));
+    let (x, y, z) = (rounded(center.x), rounded(center.y), rounded(center.z));
     notes.push(format!("the object was found at ({x}, {y}, {z}) with radius {}", rounded(radius)));
     let canonical_from_user = Similarity { scale, rotation, translation };
     Ok(CanonicalFrame { canonical_from_user, kept: false, notes })
 }
 
-/// The least radius of a sphere about `centre` that reaches all outlines of the views' masks; none with fewer than two
+/// The least radius of a sphere about `center` that reaches all outlines of the views' masks; none with fewer than two
 /// masks. In the views' lengths.
-pub fn outline_radius(views: &[View], centre: DVec3) -> Option<f64> {
+pub fn outline_radius(views: &[View], center: DVec3) -> Option<f64> {
     let silhouettes: Vec<Silhouette> = views.iter().filter_map(Silhouette::of).collect();
-    (silhouettes.len() >= 2).then(|| silhouettes.iter().map(|s| s.radius(centre)).fold(0.0, f64::max))
+    (silhouettes.len() >= 2).then(|| silhouettes.iter().map(|s| s.radius(center)).fold(0.0, f64::max))
 }
 
 fn optical_axis(view: &View) -> (DVec3, DVec3) {
@@ -219,9 +219,9 @@ pub fn nearest_point(lines: &[(DVec3, DVec3)]) -> Result<DVec3, CameraError> {
     Ok(point)
 }
 
-/// Centre and radius of the object from two or more masks.
+/// Center and radius of the object from two or more masks.
 fn from_silhouettes(silhouettes: &[Silhouette], start: DVec3) -> Result<(DVec3, f64), CameraError> {
-    let seen = |centre: DVec3| silhouettes.iter().map(|s| s.radius(centre)).fold(0.0, f64::max);
+    let seen = |center: DVec3| silhouettes.iter().map(|s| s.radius(center)).fold(0.0, f64::max);
     let hull = Hull::carve(silhouettes, start, 2.0 * seen(start)).ok_or_else(|| {
         CameraError::Frame("no point of space lies inside all masks: poses and images contradict each other".into())
     })?;
@@ -230,10 +230,10 @@ fn from_silhouettes(silhouettes: &[Silhouette], start: DVec3) -> Result<(DVec3, 
     // are measured: on 21 scanned objects the hull is twice as good at 0.17, the lines four times at 0.91.
     let one_sided = silhouettes.iter().map(|s| s.towards).sum::<DVec3>().length() / silhouettes.len() as f64;
     let t = ((one_sided - 0.4) / 0.45).clamp(0.0, 1.0);
-    let centre = hull.box_centre.lerp(start, t * t * (3.0 - 2.0 * t));
+    let center = hull.box_center.lerp(start, t * t * (3.0 - 2.0 * t));
     // The outlines bound the radius from below and come close to it; the hull bounds it from above, and guards
     // against specks that one mask has and the others do not.
-    Ok((centre, seen(centre).min(hull.radius(centre))))
+    Ok((center, seen(center).min(hull.radius(center))))
 }
 
 #[cfg(test)]

@@ -13,7 +13,7 @@ const SOLID: u8 = 128;
 /// A view's mask.
 pub(super) struct Silhouette {
     camera: Camera,
-    /// Unit directions of the rays through the mask's outline, from the camera's centre.
+    /// Unit directions of the rays through the mask's outline, from the camera's center.
     outline: Vec<DVec3>,
     /// Direction through the mask's centroid.
     pub towards: DVec3,
@@ -70,9 +70,9 @@ impl Silhouette {
         Some(Self { camera, outline, towards, origin: camera.center(), sums, cropped })
     }
 
-    /// How far from `centre` the outline's rays pass, at most: no smaller sphere about it holds the object.
-    pub fn radius(&self, centre: DVec3) -> f64 {
-        let offset = centre - self.origin;
+    /// How far from `center` the outline's rays pass, at most: no smaller sphere about it holds the object.
+    pub fn radius(&self, center: DVec3) -> f64 {
+        let offset = center - self.origin;
         self.outline.iter().map(|d| offset.cross(*d).length_squared()).fold(0.0, f64::max).sqrt()
     }
 
@@ -101,24 +101,24 @@ impl Silhouette {
 pub(super) struct Hull {
     points: Vec<DVec3>,
     /// Middle of its box along the world's axes.
-    pub box_centre: DVec3,
+    pub box_center: DVec3,
     box_half: DVec3,
     step: f64,
 }
 
 impl Hull {
-    /// Samples the cube about `centre` with the given half side, then the hull's own box again more finely. None
+    /// Samples the cube about `center` with the given half side, then the hull's own box again more finely. None
     /// where no point projects into all masks.
-    pub fn carve(silhouettes: &[Silhouette], centre: DVec3, half: f64) -> Option<Self> {
-        let coarse = Self::sample(silhouettes, centre, DVec3::splat(half))?;
+    pub fn carve(silhouettes: &[Silhouette], center: DVec3, half: f64) -> Option<Self> {
+        let coarse = Self::sample(silhouettes, center, DVec3::splat(half))?;
         let finer = coarse.box_half + DVec3::splat(0.5 * coarse.step);
-        Self::sample(silhouettes, coarse.box_centre, finer)
+        Self::sample(silhouettes, coarse.box_center, finer)
     }
 
-    fn sample(silhouettes: &[Silhouette], centre: DVec3, half: DVec3) -> Option<Self> {
+    fn sample(silhouettes: &[Silhouette], center: DVec3, half: DVec3) -> Option<Self> {
         let step = 2.0 * half.max_element() / GRID as f64;
         let counts = (2.0 * half / step).ceil().max(DVec3::ONE);
-        let low = centre - 0.5 * step * (counts - DVec3::ONE);
+        let low = center - 0.5 * step * (counts - DVec3::ONE);
         let (nx, ny, nz) = (counts.x as usize, counts.y as usize, counts.z as usize);
         let mut points = Vec::new();
         let (mut least, mut most) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
@@ -132,11 +132,11 @@ impl Hull {
         if points.is_empty() {
             return None;
         }
-        Some(Self { points, box_centre: 0.5 * (least + most), box_half: 0.5 * (most - least), step })
+        Some(Self { points, box_center: 0.5 * (least + most), box_half: 0.5 * (most - least), step })
     }
 
-    /// Radius of the smallest sphere about `centre` that holds the hull's points.
-    pub fn radius(&self, centre: DVec3) -> f64 {
-        self.points.iter().map(|p| p.distance_squared(centre)).fold(0.0, f64::max).sqrt()
+    /// Radius of the smallest sphere about `center` that holds the hull's points.
+    pub fn radius(&self, center: DVec3) -> f64 {
+        self.points.iter().map(|p| p.distance_squared(center)).fold(0.0, f64::max).sqrt()
     }
 }

@@ -1,9 +1,9 @@
-//! Cutting an object out of one plain background colour.
+//! Cutting an object out of one plain background color.
 
 use image::{Rgba, RgbaImage};
 use std::collections::VecDeque;
 
-/// How far a pixel may lie from the background colour, in 8-bit steps of its worst channel, and still be
+/// How far a pixel may lie from the background color, in 8-bit steps of its worst channel, and still be
 /// background: enough for JPEG's noise.
 pub const BACKGROUND_TOLERANCE: u8 = 12;
 /// The part of the image's border that must be background.
@@ -20,12 +20,12 @@ fn near(p: &Rgba<u8>, background: [u8; 3]) -> bool {
     (0..3).all(|c| p[c].abs_diff(background[c]) <= BACKGROUND_TOLERANCE)
 }
 
-/// Gives an image an alpha channel: `(the object, the background colour)`, or what it shows instead.
+/// Gives an image an alpha channel: `(the object, the background color)`, or what it shows instead.
 ///
-/// The background is the median colour of the image's border, and must fill nine tenths of it within
-/// [`BACKGROUND_TOLERANCE`]. It is flooded from the border, so that parts of the object may have its colour; what
+/// The background is the median color of the image's border, and must fill nine tenths of it within
+/// [`BACKGROUND_TOLERANCE`]. It is flooded from the border, so that parts of the object may have its color; what
 /// the object encloses (a cup's handle) stays opaque. Along the edge, two pixels wide, each pixel is taken as a
-/// mixture of the background and the object's colour next to it.
+/// mixture of the background and the object's color next to it.
 ///
 /// Undistorted photos have an empty rim: transparent, or black. It is no backdrop. The border is then that of what is shown.
 pub fn cut_out(image: &RgbaImage) -> Result<(RgbaImage, [u8; 3]), String> {
@@ -36,21 +36,21 @@ pub fn cut_out(image: &RgbaImage) -> Result<(RgbaImage, [u8; 3]), String> {
     let shown: Vec<bool> = image.pixels().map(|p| p[3] >= 128).collect();
     let found = backdrop(image, &shown);
     // Black along the border may be a rim, with the backdrop within it.
-    if found.as_ref().is_ok_and(|b| b.colour.iter().any(|c| *c > BACKGROUND_TOLERANCE)) {
+    if found.as_ref().is_ok_and(|b| b.color.iter().any(|c| *c > BACKGROUND_TOLERANCE)) {
         return found.map(|b| separate(image, &b));
     }
     if let Some(inner) = without_black_rim(image, &shown)
         && let Ok(within) = backdrop(image, &inner)
-        && within.colour.iter().any(|c| *c > 2 * BACKGROUND_TOLERANCE)
+        && within.color.iter().any(|c| *c > 2 * BACKGROUND_TOLERANCE)
     {
         return Ok(separate(image, &within));
     }
     found.map(|b| separate(image, &b))
 }
 
-/// A plain backdrop: its colour, and for every pixel 0 where it or nothing is shown, else `u8::MAX`.
+/// A plain backdrop: its color, and for every pixel 0 where it or nothing is shown, else `u8::MAX`.
 struct Backdrop {
-    colour: [u8; 3],
+    color: [u8; 3],
     depth: Vec<u8>,
 }
 
@@ -71,7 +71,7 @@ fn flood(w: u32, h: u32, seeds: &[(u32, u32)], inside: impl Fn(u32, u32) -> bool
     reached
 }
 
-/// The four neighbours within the image.
+/// The four neighbors within the image.
 fn around(x: u32, y: u32, w: u32, h: u32) -> impl Iterator<Item = (u32, u32)> {
     [(x.wrapping_sub(1), y), (x + 1, y), (x, y.wrapping_sub(1)), (x, y + 1)]
         .into_iter()
@@ -104,23 +104,23 @@ fn backdrop(image: &RgbaImage, shown: &[bool]) -> Result<Backdrop, String> {
     if border.is_empty() {
         return Err("an image that is transparent everywhere".into());
     }
-    let colour: [u8; 3] = std::array::from_fn(|c| {
+    let color: [u8; 3] = std::array::from_fn(|c| {
         let mut values: Vec<u8> = border.iter().map(|&(x, y)| image.get_pixel(x, y)[c]).collect();
         values.sort_unstable();
         values[values.len() / 2]
     });
-    let seeds: Vec<(u32, u32)> = border.iter().copied().filter(|&(x, y)| near(image.get_pixel(x, y), colour)).collect();
+    let seeds: Vec<(u32, u32)> = border.iter().copied().filter(|&(x, y)| near(image.get_pixel(x, y), color)).collect();
     let share = seeds.len() as f64 / border.len() as f64;
     if share < BORDER_SHARE {
         return Err(format!("a border of which only {:.0} % has one color", 100.0 * share));
     }
-    let reached = flood(w, h, &seeds, |x, y| shown[index(x, y)] && near(image.get_pixel(x, y), colour));
+    let reached = flood(w, h, &seeds, |x, y| shown[index(x, y)] && near(image.get_pixel(x, y), color));
     let depth: Vec<u8> = reached.iter().zip(shown).map(|(r, s)| if *r || !s { 0 } else { u8::MAX }).collect();
     let object = depth.iter().filter(|d| **d != 0).count();
     if (object as f64) < SMALLEST_OBJECT * depth.len() as f64 {
-        return Err(format!("nothing but the color {colour:?}"));
+        return Err(format!("nothing but the color {color:?}"));
     }
-    Ok(Backdrop { colour, depth })
+    Ok(Backdrop { color, depth })
 }
 
 /// What is shown within a black rim: none where black along the border is no such rim, but a backdrop or the object.
@@ -163,7 +163,7 @@ pub fn fills_frame(shown: &[bool], w: u32, h: u32, least: f64) -> bool {
 fn separate(image: &RgbaImage, found: &Backdrop) -> (RgbaImage, [u8; 3]) {
     let (w, h) = image.dimensions();
     let index = |x: u32, y: u32| y as usize * w as usize + x as usize;
-    let (background, mut depth) = (found.colour, found.depth.clone());
+    let (background, mut depth) = (found.color, found.depth.clone());
     let window = |x: u32, y: u32, r: u32| {
         let (xs, ys) = (x.saturating_sub(r)..=(x + r).min(w - 1), y.saturating_sub(r)..=(y + r).min(h - 1));
         ys.flat_map(move |y| xs.clone().map(move |x| (x, y)))
@@ -192,7 +192,7 @@ fn separate(image: &RgbaImage, found: &Backdrop) -> (RgbaImage, [u8; 3]) {
     (out, background)
 }
 
-/// Splits a pixel into `alpha object + (1 - alpha) background`, with the object's colour taken from its neighbours.
+/// Splits a pixel into `alpha object + (1 - alpha) background`, with the object's color taken from its neighbors.
 /// Where those are missing or look like the background, the pixel stays opaque.
 fn unmix<'a>(p: Rgba<u8>, background: [u8; 3], inside: impl Iterator<Item = &'a Rgba<u8>>) -> Rgba<u8> {
     let (mut sum, mut count) = ([0.0f32; 3], 0.0f32);
@@ -222,6 +222,6 @@ fn unmix<'a>(p: Rgba<u8>, background: [u8; 3], inside: impl Iterator<Item = &'a 
     if alpha < 0.004 {
         return Rgba([0; 4]);
     }
-    let colour = |c: usize| (b[c] + (f32::from(p[c]) - b[c]) / alpha).round().clamp(0.0, 255.0) as u8;
-    Rgba([colour(0), colour(1), colour(2), (255.0 * alpha).round() as u8])
+    let color = |c: usize| (b[c] + (f32::from(p[c]) - b[c]) / alpha).round().clamp(0.0, 255.0) as u8;
+    Rgba([color(0), color(1), color(2), (255.0 * alpha).round() as u8])
 }

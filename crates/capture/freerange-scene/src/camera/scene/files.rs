@@ -105,8 +105,8 @@ impl Images {
         let background = |found: String| CameraError::Background { place: place(), image: path.clone(), found };
         let alpha = |image: &RgbaImage, value: u8| image.pixels().all(|p| p[3] == value);
         if alpha(&image, 255) {
-            let (object, colour) = cut_out(&image).map_err(background)?;
-            self.cut.push((frame.name.clone(), colour));
+            let (object, color) = cut_out(&image).map_err(background)?;
+            self.cut.push((frame.name.clone(), color));
             image = object;
         } else if input && alpha(&image, 0) {
             return Err(background("an image that is transparent everywhere".into()));

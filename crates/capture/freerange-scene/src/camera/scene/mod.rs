@@ -41,7 +41,7 @@ impl Scene {
     /// Loads a scene from a folder or from one JSON file, images included.
     ///
     /// Images come out as 8-bit RGBA with straight alpha. One without alpha must show the object before one plain
-    /// colour, which is then cut away. Whatever cannot be used is refused with its file, frame and field.
+    /// color, which is then cut away. Whatever cannot be used is refused with its file, frame and field.
     pub fn load(path: &Path) -> Result<Self, CameraError> {
         let found = Found::at(path)?;
         let mut notes = found.notes;
@@ -54,7 +54,7 @@ impl Scene {
         }
         let mut images = Images::default();
         let inputs = images.load_all(&description, &train, true)?;
-        refuse_one_centre(&inputs, whole)?;
+        refuse_one_center(&inputs, whole)?;
         let mut further = images.load_all(&description, &rest, false)?;
         notes.extend(description.notes);
         if let Some(file) = found.further {
@@ -135,11 +135,11 @@ impl Found {
 }
 
 /// Without a baseline there is no depth, whatever the images show.
-fn refuse_one_centre(views: &[View], place: Place) -> Result<(), CameraError> {
+fn refuse_one_center(views: &[View], place: Place) -> Result<(), CameraError> {
     let first = views[0].camera.center();
     let same = |view: &View| view.camera.center().distance(first) <= 1e-6 * (1e-6 + first.length());
     if views.iter().all(same) {
-        return Err(CameraError::SameCentre { place, count: views.len() });
+        return Err(CameraError::SameCenter { place, count: views.len() });
     }
     Ok(())
 }

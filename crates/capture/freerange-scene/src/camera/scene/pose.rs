@@ -19,9 +19,9 @@ pub fn world_to_camera(rows: &[[f64; 4]], place: &Place) -> Result<DMat4, Camera
         }
     }
     let column = |j: usize| DVec3::new(rows[0][j], rows[1][j], rows[2][j]);
-    let (rotation, centre) = (DMat3::from_cols(column(0), column(1), column(2)), column(3));
-    if centre.abs().max_element() > LARGEST_COORDINATE {
-        return refuse(format!("a camera at {centre}, farther than {LARGEST_COORDINATE} from the origin"));
+    let (rotation, center) = (DMat3::from_cols(column(0), column(1), column(2)), column(3));
+    if center.abs().max_element() > LARGEST_COORDINATE {
+        return refuse(format!("a camera at {center}, farther than {LARGEST_COORDINATE} from the origin"));
     }
     let rotation = match nearest_rotation(rotation) {
         Ok(r) => r,
@@ -29,7 +29,7 @@ pub fn world_to_camera(rows: &[[f64; 4]], place: &Place) -> Result<DMat4, Camera
     };
     let world_from_camera = rotation * DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
     let camera_from_world = world_from_camera.transpose();
-    let translation = -(camera_from_world * centre);
+    let translation = -(camera_from_world * center);
     Ok(DMat4::from_cols(
         camera_from_world.x_axis.extend(0.0),
         camera_from_world.y_axis.extend(0.0),

@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use freerange_assets::render::{CameraConfig, LightingConfig};
-use freerange_gaussians::{Cloud, channel};
+use freerange_gaussians::{Gaussians, channel};
 use freerange_scene::camera::{Camera, View};
 use glam::DVec3;
 use image::RgbaImage;
@@ -55,10 +55,12 @@ fn toy(seed: u64) -> Object {
         View { name: format!("photo {i}"), camera, image: RgbaImage::from_fn(6, 4, |_, _| image::Rgba(rng.random())) }
     });
     let views = views.collect();
-    let mut cloud = |n: usize| Cloud::from_rows((0..n * channel::COUNT).map(|_| rng.random_range(-1.0..1.0)).collect());
+    let mut cloud =
+        |n: usize| Gaussians::from_rows((0..n * channel::COUNT).map(|_| rng.random_range(-1.0..1.0)).collect());
     let slices = BTreeMap::from([(2, cloud(4)), (3, cloud(8))]);
     // Numbers that 16 bits hold.
-    let mut fit = || Cloud::from_rows((0..4 * channel::COUNT).map(|_| f32::from(rng.random::<i8>()) / 64.0).collect());
+    let mut fit =
+        || Gaussians::from_rows((0..4 * channel::COUNT).map(|_| f32::from(rng.random::<i8>()) / 64.0).collect());
     let input_fits = [vec![1], vec![1, 0]].map(|views| InputFit { views, gaussians: fit(), mended: fit() }).to_vec();
     Object { id: generated_id(seed), views, slices, input_fits }
 }
@@ -106,7 +108,7 @@ fn metadata_of(object: &Object) -> Metadata {
     }
 }
 
-/// Writes a ball of 320 triangles with a band of another colour as a PLY mesh.
+/// Writes a ball of 320 triangles with a band of another color as a PLY mesh.
 pub(crate) fn write_ball(path: &Path) {
     let (rings, sides) = (9, 20);
     let mut text = format!(

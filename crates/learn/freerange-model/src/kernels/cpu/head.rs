@@ -51,7 +51,7 @@ fn scaled(x: &[f32], stride: usize, factor: f32, width: usize, out: &mut [f32]) 
 /// Gathers the rows of one head as `factor weight x / rms(x)`, `[n, width]`; without weights, as `factor x`.
 pub fn gather(x: &[f32], stride: usize, weight: Option<&[f32]>, factor: f32, width: usize, out: &mut [f32]) {
     match weight {
-        Some(weight) => normalised(x, stride, weight, factor, out),
+        Some(weight) => normalized(x, stride, weight, factor, out),
         None => scaled(x, stride, factor, width, out),
     }
 }
@@ -66,13 +66,13 @@ pub fn gather_backward(
     d_weight: &mut [f32],
 ) {
     match weight {
-        Some(weight) => normalised_backward(x, stride, weight, factor, grad, d_weight),
+        Some(weight) => normalized_backward(x, stride, weight, factor, grad, d_weight),
         None => scale_row(grad, factor),
     }
 }
 
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma"))]
-fn normalised(x: &[f32], stride: usize, weight: &[f32], factor: f32, out: &mut [f32]) {
+fn normalized(x: &[f32], stride: usize, weight: &[f32], factor: f32, out: &mut [f32]) {
     let width = weight.len();
     for (i, out) in out.chunks_exact_mut(width).enumerate() {
         let x = &x[i * stride..][..width];
@@ -85,7 +85,7 @@ fn normalised(x: &[f32], stride: usize, weight: &[f32], factor: f32, out: &mut [
 
 /// With r = 1 / rms(x) and h = weight grad: dx = r (h - x r^2 mean(h x)).
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma", "x86_64+avx2+fma"))]
-fn normalised_backward(x: &[f32], stride: usize, weight: &[f32], factor: f32, grad: &mut [f32], d_weight: &mut [f32]) {
+fn normalized_backward(x: &[f32], stride: usize, weight: &[f32], factor: f32, grad: &mut [f32], d_weight: &mut [f32]) {
     let width = weight.len();
     for (i, grad) in grad.chunks_exact_mut(width).enumerate() {
         let x = &x[i * stride..][..width];

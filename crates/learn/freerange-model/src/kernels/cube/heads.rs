@@ -1,6 +1,6 @@
 //! From tokens `[b, t, 3 d]` to heads `[b heads, t, width]`: norms of queries and keys, and their gradients.
 //!
-//! The numbers of one token's head are read by a group of neighbouring units, as many as it has vectors if a cube can
+//! The numbers of one token's head are read by a group of neighboring units, as many as it has vectors if a cube can
 //! have so many.
 
 use burn::tensor::DType;

@@ -51,16 +51,16 @@ fn standardise<N: Size>(
     #[unroll]
     for i in 0..comptime!(vectors.div_ceil(units)) {
         if UNIT_POS as usize + i * units < vectors {
-            let centred = row[i] - Vector::new(mean);
-            row[i] = centred;
-            squares += centred * centred;
+            let centerd = row[i] - Vector::new(mean);
+            row[i] = centerd;
+            squares += centerd * centerd;
         }
     }
     let variance = cube_sum(across::<N>(squares), scratch, units) / width;
     1.0f32 / f32::sqrt(variance + epsilon)
 }
 
-/// A cube normalises `rows` rows.
+/// A cube normalizes `rows` rows.
 #[cube(launch_unchecked, address_type = "dynamic")]
 fn norm_kernel<E: Float, N: Size>(
     x: &Tensor<Vector<f32, N>>,

@@ -66,7 +66,7 @@ pub fn cube_max(value: f32, scratch: &mut Shared<[f32]>, #[comptime] units: usiz
     scratch[0]
 }
 
-/// The sum over each `size` neighbouring units of a cube, for each of them.
+/// The sum over each `size` neighboring units of a cube, for each of them.
 #[cube]
 pub fn group_sum(value: f32, scratch: &mut Shared<[f32]>, #[comptime] size: usize) -> f32 {
     let unit = UNIT_POS as usize;

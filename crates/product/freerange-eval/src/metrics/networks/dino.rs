@@ -54,5 +54,5 @@ pub(crate) fn prepare(image: &Image8, out: &mut Vec<f32>) {
     let longer = |side: usize| (SHORTER_SIDE * side / shorter).max(SHORTER_SIDE);
     let resized = image.bicubic(longer(image.width), longer(image.height));
     let (mean, deviation) = ([0.485, 0.456, 0.406], [0.229, 0.224, 0.225]);
-    resized.centre_crop(CROP, CROP).append_normalised(mean, deviation, out);
+    resized.center_crop(CROP, CROP).append_normalized(mean, deviation, out);
 }

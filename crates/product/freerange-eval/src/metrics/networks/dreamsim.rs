@@ -105,7 +105,7 @@ impl DreamSim {
         for branch in &self.branches {
             let (mean, deviation) = branch.mean_and_deviation;
             let mut values = Vec::with_capacity(images.len() * 3 * self.side * self.side);
-            resized.iter().for_each(|image| image.append_normalised(mean, deviation, &mut values));
+            resized.iter().for_each(|image| image.append_normalized(mean, deviation, &mut values));
             let pixels = TensorData::new(values, [images.len(), 3, self.side, self.side]);
             let features = branch.vit.forward(Tensor::from_data(pixels, &self.device));
             for (all, row) in out.iter_mut().zip(super::rows(features)) {

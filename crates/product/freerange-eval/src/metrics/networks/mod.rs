@@ -184,7 +184,7 @@ impl Evaluator {
             return Err(ImageError::NotFinite { image: "image", index, value: image[index].to_string() }.into());
         }
         let mut planes = Vec::with_capacity(CHANNELS * VGG_SIDE * VGG_SIDE);
-        Image8::quantised(image, width, height).append_bilinear(VGG_SIDE, VGG_SIDE, &mut planes);
+        Image8::quantized(image, width, height).append_bilinear(VGG_SIDE, VGG_SIDE, &mut planes);
         let pixels = Tensor::from_data(TensorData::new(planes, [1, CHANNELS, VGG_SIDE, VGG_SIDE]), &self.device);
         Ok(Some(host(vgg.deepest((pixels + 1.0) / 2.0))))
     }
@@ -232,7 +232,7 @@ impl Evaluator {
                 .iter()
                 .map(|p| p.render)
                 .chain(pairs.iter().map(|p| p.truth))
-                .map(|v| Image8::quantised(v, width, height))
+                .map(|v| Image8::quantized(v, width, height))
                 .collect(),
             false => Vec::new(),
         };

@@ -1,4 +1,4 @@
-//! Resizing and normalising images as the networks' authors do, on plain slices.
+//! Resizing and normalizing images as the networks' authors do, on plain slices.
 
 use freerange_raster::metrics::CHANNELS;
 
@@ -12,7 +12,7 @@ pub(crate) struct Image8 {
 
 impl Image8 {
     /// What a lossless file of an image in 0..1 holds: nearest of 256 levels, clamped.
-    pub fn quantised(values: &[f32], width: usize, height: usize) -> Self {
+    pub fn quantized(values: &[f32], width: usize, height: usize) -> Self {
         Self { width, height, values: values.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect() }
     }
 
@@ -53,7 +53,7 @@ impl Image8 {
     ///
     /// # Panics
     /// If the image is smaller.
-    pub fn centre_crop(&self, width: usize, height: usize) -> Self {
+    pub fn center_crop(&self, width: usize, height: usize) -> Self {
         assert!(width <= self.width && height <= self.height, "the crop is larger than the image");
         let (left, top) = ((self.width - width) / 2, (self.height - height) / 2);
         let rows = self.values.chunks_exact(self.width * CHANNELS).skip(top).take(height);
@@ -62,17 +62,17 @@ impl Image8 {
     }
 
     /// Planes of `(value / 255 - mean) / deviation`, appended. `[3, height, width]`
-    pub fn append_normalised(&self, mean: [f32; 3], deviation: [f32; 3], out: &mut Vec<f32>) {
+    pub fn append_normalized(&self, mean: [f32; 3], deviation: [f32; 3], out: &mut Vec<f32>) {
         for channel in 0..CHANNELS {
             let values = self.values[channel..].iter().step_by(CHANNELS);
             out.extend(values.map(|&v| (f32::from(v) / 255.0 - mean[channel]) / deviation[channel]));
         }
     }
 
-    /// Planes of the image in -1..1, resized bilinearly without antialiasing (pixel centres at +0.5, border pixels
+    /// Planes of the image in -1..1, resized bilinearly without antialiasing (pixel centers at +0.5, border pixels
     /// repeated), as PyTorch's `interpolate` does, appended. `[3, height, width]`
     pub fn append_bilinear(&self, width: usize, height: usize, out: &mut Vec<f32>) {
-        let (columns, rows) = (neighbours(self.width, width), neighbours(self.height, height));
+        let (columns, rows) = (neighbors(self.width, width), neighbors(self.height, height));
         for channel in 0..CHANNELS {
             let at = |row: usize, column: usize| {
                 f32::from(self.values[(row * self.width + column) * CHANNELS + channel]) / 255.0
@@ -114,10 +114,10 @@ fn taps(from: usize, to: usize) -> Vec<(usize, Vec<i64>)> {
     let support = 2.0 * stretch;
     (0..to)
         .map(|i| {
-            let centre = (i as f64 + 0.5) * scale;
-            let first = (centre - support + 0.5).max(0.0) as usize;
-            let end = ((centre + support + 0.5) as usize).min(from);
-            let weights: Vec<f64> = (first..end).map(|k| cubic((k as f64 - centre + 0.5) / stretch)).collect();
+            let center = (i as f64 + 0.5) * scale;
+            let first = (center - support + 0.5).max(0.0) as usize;
+            let end = ((center + support + 0.5) as usize).min(from);
+            let weights: Vec<f64> = (first..end).map(|k| cubic((k as f64 - center + 0.5) / stretch)).collect();
             let total: f64 = weights.iter().sum();
             let fixed = |w: f64| (w / total * f64::from(1u32 << PRECISION)).round() as i64;
             (first, weights.into_iter().map(fixed).collect())
@@ -125,8 +125,8 @@ fn taps(from: usize, to: usize) -> Vec<(usize, Vec<i64>)> {
         .collect()
 }
 
-/// For each output pixel the two input pixels around its centre and the second's share.
-fn neighbours(from: usize, to: usize) -> Vec<(usize, usize, f32)> {
+/// For each output pixel the two input pixels around its center and the second's share.
+fn neighbors(from: usize, to: usize) -> Vec<(usize, usize, f32)> {
     let scale = from as f32 / to as f32;
     (0..to)
         .map(|i| {

@@ -23,7 +23,7 @@ pub(crate) struct VitConfig {
     pub side: usize,
     /// `x sigmoid(1.702 x)` in place of GELU: OpenAI's CLIP.
     pub quick_gelu: bool,
-    /// Normalise the tokens before the first block (CLIP); the file calls it `pos_drop`.
+    /// Normalize the tokens before the first block (CLIP); the file calls it `pos_drop`.
     pub pre_norm: bool,
     pub epsilon: f64,
     /// The class token after the final norm, projected to this width (CLIP). `None`: the class token as it leaves the
@@ -126,7 +126,7 @@ impl Vit {
         })
     }
 
-    /// Features of normalised images. `[b, 3, side, side]` to `[b, width]`
+    /// Features of normalized images. `[b, 3, side, side]` to `[b, width]`
     pub fn forward(&self, images: Tensor<4>) -> Tensor<2> {
         let c = &self.config;
         let [b, _, _, _] = images.dims();

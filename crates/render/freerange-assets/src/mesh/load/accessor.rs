@@ -220,7 +220,7 @@ impl Accessor<'_> {
         self.bytes(i).map_or(0, |b| unsigned(self.component, b))
     }
 
-    /// Value `i` as numbers, normalised if the accessor says so; components that it lacks are zero.
+    /// Value `i` as numbers, normalized if the accessor says so; components that it lacks are zero.
     pub fn numbers<const N: usize>(&self, i: usize) -> [f32; N] {
         let mut out = [0.0; N];
         let Some(bytes) = self.bytes(i) else { return out };

@@ -8,7 +8,7 @@ use super::{Loaded, Up};
 use crate::mesh::error::MeshError;
 use crate::mesh::triangles::Mesh;
 
-/// Drops what does not count (degenerate triangles, unreferenced vertices), turns +z up, centres the bounding box, scales
+/// Drops what does not count (degenerate triangles, unreferenced vertices), turns +z up, centers the bounding box, scales
 /// the farthest vertex to 0.5 and fills in missing normals.
 pub fn finish(mut job: Job, mut soup: Soup, up: Up) -> Result<Loaded, MeshError> {
     if soup.triangles.is_empty() {
@@ -156,7 +156,7 @@ mod tests {
     }
 
     #[test]
-    fn the_box_is_centred_and_the_farthest_vertex_is_at_half() {
+    fn the_box_is_centerd_and_the_farthest_vertex_is_at_half() {
         // The last vertex is far away and not used.
         let points = [[10.0, 0.0, 0.0], [14.0, 0.0, 0.0], [10.0, 3.0, 0.0], [1e6, 0.0, f64::NAN]];
         let loaded = run(triangle_soup(&points, &[[0, 1, 2]]), Up::Z).unwrap();
@@ -164,7 +164,7 @@ mod tests {
         assert_eq!(mesh.positions.len(), 3);
         let radius = mesh.positions.iter().map(|p| p.length()).fold(0.0, f32::max);
         assert!((radius - 0.5).abs() < 1e-5, "{radius}");
-        // Box (10..14, 0..3): centre (12, 1.5), diagonal 5.
+        // Box (10..14, 0..3): center (12, 1.5), diagonal 5.
         assert!(mesh.positions[1].distance(Vec3::new(0.4, -0.3, 0.0)) < 1e-5);
         assert!(mesh.normals.iter().all(|n| n.distance(Vec3::Z) < 1e-6));
         let moved = loaded.canonical_from_file.transform_point3(points[1].into());

@@ -317,7 +317,7 @@ fn add_primitive(
             let [r, g, b, alpha] = a.numbers::<4>(i);
             Vec4::new(r, g, b, if a.width == 4 { alpha } else { 1.0 })
         });
-        // Normalised in double precision: the cofactors of small scales would underflow.
+        // Normalized in double precision: the cofactors of small scales would underflow.
         soup.vertex(position, normal.normalize_or_zero().as_vec3(), uv, color);
     }
     for t in corners.chunks_exact(3) {

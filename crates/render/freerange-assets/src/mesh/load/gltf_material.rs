@@ -85,7 +85,7 @@ impl Materials {
         let mut metallic_roughness = pbr.metallic_roughness_texture.as_ref();
         let (mut metallic, mut roughness) = (pbr.metallic_factor.0, pbr.roughness_factor.0);
         if let Some(old) = extensions.and_then(|e| e.pbr_specular_glossiness.as_ref()) {
-            job.note("specular colours of KHR_materials_pbrSpecularGlossiness are ignored");
+            job.note("specular colors of KHR_materials_pbrSpecularGlossiness are ignored");
             factor = old.diffuse_factor.0;
             base = old.diffuse_texture.as_ref();
             metallic_roughness = None;
@@ -101,7 +101,7 @@ impl Materials {
         let emission = Vec3::from(source.emissive_factor.0)
             * extensions.and_then(|e| e.emissive_strength.as_ref()).map_or(1.0, |s| s.emissive_strength.0);
 
-        // A vertex carries one set: that of the base colour, else that of the first map there is.
+        // A vertex carries one set: that of the base color, else that of the first map there is.
         let set = |r: &Reference| r.uv_set;
         let uv_set = base
             .as_ref()
@@ -117,7 +117,7 @@ impl Materials {
             }
             Some(r) => self.map(job, document, &format!("{name}: {what} map"), r, srgb),
         };
-        let base = map(base, "base colour", true)?;
+        let base = map(base, "base color", true)?;
         let metallic_roughness = map(metallic_roughness, "metallic-roughness", false)?;
         let (normal, scale) = normal.map_or((None, 1.0), |(r, scale)| (Some(r), scale));
         let normal_map = map(normal, "normal", false)?.map(|m| (m, scale));

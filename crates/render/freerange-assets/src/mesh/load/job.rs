@@ -199,7 +199,7 @@ impl Soup {
         Ok(())
     }
 
-    /// Adds a vertex and returns its index. Broken normals, texture coordinates and colours become neutral; positions
+    /// Adds a vertex and returns its index. Broken normals, texture coordinates and colors become neutral; positions
     /// are checked at the end, where it is known which ones are used.
     pub fn vertex(&mut self, position: DVec3, normal: Vec3, uv: Vec2, color: Vec4) -> u32 {
         self.positions.push(position);

@@ -99,7 +99,7 @@ impl MeshFormat {
 /// A mesh from a file.
 #[derive(Clone, Debug)]
 pub struct Loaded {
-    /// The mesh in the canonical frame: +z up, its bounding box centred, its farthest vertex 0.5 from the origin.
+    /// The mesh in the canonical frame: +z up, its bounding box centerd, its farthest vertex 0.5 from the origin.
     pub mesh: Mesh,
     /// What was ignored or repaired.
     pub notes: Vec<String>,

@@ -1,6 +1,6 @@
 //! Wavefront OBJ.
 //!
-//! Parsing is `tobj`'s. What it would stumble over (indices out of range, colours or normals of some vertices only,
+//! Parsing is `tobj`'s. What it would stumble over (indices out of range, colors or normals of some vertices only,
 //! encodings other than UTF-8) is found before, line by line, together with the counts that the limits are about.
 
 use std::collections::{BTreeMap, HashMap};
@@ -15,7 +15,7 @@ use super::obj_text::{split, statements};
 use crate::mesh::error::MeshError;
 use crate::mesh::srgb::srgb_to_linear;
 
-/// Reads a file and its material libraries into triangles in the file's frame. Polygons become fans. Vertex colours are
+/// Reads a file and its material libraries into triangles in the file's frame. Polygons become fans. Vertex colors are
 /// taken as sRGB, as the programs that write this extension do; v is flipped to run down.
 pub fn read(job: &mut Job, bytes: &[u8]) -> Result<Soup, MeshError> {
     let text = String::from_utf8_lossy(bytes);
@@ -91,13 +91,13 @@ fn count(job: &mut Job, text: &str) -> Result<Counts, MeshError> {
         }
     }
     if n.colored > 0 && n.colored < n.vertices {
-        job.note("vertex colours are ignored: not all vertices have one");
+        job.note("vertex colors are ignored: not all vertices have one");
     }
     if n.corners_with_normal > 0 && n.corners_with_normal < n.corners {
         job.note("normals are ignored: not all corners have one");
     }
     if n.corners_with_uv > 0 && n.corners_with_uv < n.corners {
-        job.note("corners without texture coordinates take those of their neighbour");
+        job.note("corners without texture coordinates take those of their neighbor");
     }
     Ok(n)
 }
@@ -192,7 +192,7 @@ fn build(
                 let material = match key {
                     None => {
                         if !libraries.is_empty() {
-                            job.note("faces without a known material are grey");
+                            job.note("faces without a known material are gray");
                         }
                         default_material()
                     }

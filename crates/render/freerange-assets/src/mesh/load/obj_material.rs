@@ -21,7 +21,7 @@ pub struct Library {
     folder: String,
 }
 
-/// Pictures by file name and whether they are colours; `None` for those that are missing.
+/// Pictures by file name and whether they are colors; `None` for those that are missing.
 pub type Pictures = HashMap<(String, bool), Option<Arc<Picture>>>;
 
 /// Reads a library; `None` if there is no such file in the mesh's folder.
@@ -33,7 +33,7 @@ pub fn read_library(job: &mut Job, name: &str) -> Result<Option<Library>, MeshEr
     Ok(Some(Library { text, folder }))
 }
 
-/// `tobj` wants three numbers for every colour and stops at the first statement it cannot parse; the format allows one
+/// `tobj` wants three numbers for every color and stops at the first statement it cannot parse; the format allows one
 /// number, and writers are careless.
 fn clean(job: &mut Job, text: &str) -> Result<String, MeshError> {
     let mut clean = String::with_capacity(text.len());
@@ -47,8 +47,8 @@ fn clean(job: &mut Job, text: &str) -> Result<String, MeshError> {
                 !rest.is_empty()
             }
             "Ka" | "Kd" | "Ks" | "Ke" => {
-                if let [grey] = numbers[..] {
-                    clean.push_str(&format!("{key} {grey} {grey} {grey}\n"));
+                if let [gray] = numbers[..] {
+                    clean.push_str(&format!("{key} {gray} {gray} {gray}\n"));
                     continue;
                 }
                 numbers.len() >= 3
@@ -70,12 +70,12 @@ fn clean(job: &mut Job, text: &str) -> Result<String, MeshError> {
     Ok(clean)
 }
 
-/// Grey plastic, for faces without a material.
+/// Gray plastic, for faces without a material.
 pub fn default_material() -> Material {
     Material { specular: 0.04, roughness: 0.5, ..Material::matt(Texture::Flat(Vec3::splat(0.8))) }
 }
 
-/// A material of the mesh from one of a library. `map_Kd` stands in the place of `Kd`, as most writers mean it; colours
+/// A material of the mesh from one of a library. `map_Kd` stands in the place of `Kd`, as most writers mean it; colors
 /// are linear. The exponent `Ns` becomes the roughness of equal width, and `Ks` of one half the reflectance 0.04.
 pub fn convert(
     job: &mut Job,
@@ -275,9 +275,9 @@ mod tests {
     fn normals_are_told_from_heights() {
         let normals = RgbaImage::from_fn(8, 8, |x, _| image::Rgba([100 + 8 * x as u8, 128, 250, 255]));
         assert!(looks_like_normals(&Picture::new(normals, false)));
-        for grey in [0, 128, 200, 255] {
-            let heights = RgbaImage::from_pixel(8, 8, image::Rgba([grey, grey, grey, 255]));
-            assert!(!looks_like_normals(&Picture::new(heights, false)), "{grey}");
+        for gray in [0, 128, 200, 255] {
+            let heights = RgbaImage::from_pixel(8, 8, image::Rgba([gray, gray, gray, 255]));
+            assert!(!looks_like_normals(&Picture::new(heights, false)), "{gray}");
         }
     }
 

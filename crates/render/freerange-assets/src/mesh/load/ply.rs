@@ -21,7 +21,7 @@ use crate::mesh::texture::Texture;
 /// A header is short; this bounds the memory for its parsed form.
 const MAX_HEADER: usize = 1 << 20;
 
-/// Reads a file into triangles in the file's frame. Polygons become fans; colours are taken as sRGB; v is flipped to run
+/// Reads a file into triangles in the file's frame. Polygons become fans; colors are taken as sRGB; v is flipped to run
 /// down. A `comment TextureFile name`, as some scanners' programs write it, names the texture.
 pub fn read(job: &mut Job, bytes: &[u8]) -> Result<Soup, MeshError> {
     let head = &bytes[..bytes.len().min(MAX_HEADER)];
@@ -127,7 +127,7 @@ impl PropertyAccess for Vertex {
     }
 
     fn set_property(&mut self, name: &str, value: Property) -> PropertyAccessResult {
-        // The value, and the number that stands for a full colour channel.
+        // The value, and the number that stands for a full color channel.
         let (x, full) = match value {
             Property::Char(x) => (f64::from(x), 127.0),
             Property::UChar(x) => (x.into(), 255.0),

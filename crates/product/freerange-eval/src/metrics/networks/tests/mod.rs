@@ -1,6 +1,6 @@
 //! The networks against PyTorch's results, and what they do to known changes of an image.
 
-mod behaviour;
+mod behavior;
 mod dreamsim;
 mod files;
 mod inception;

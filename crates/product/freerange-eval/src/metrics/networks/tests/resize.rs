@@ -17,15 +17,15 @@ fn bicubic_is_pillows() {
 fn bicubic_keeps_what_it_should() {
     let image = Image8 { width: 5, height: 3, values: (0..45).map(|i| (i * 5) as u8).collect() };
     assert_eq!(image.bicubic(5, 3), image);
-    let grey = Image8 { width: 9, height: 7, values: vec![77; 9 * 7 * 3] };
-    assert!(grey.bicubic(20, 2).values.iter().all(|&v| v == 77));
+    let gray = Image8 { width: 9, height: 7, values: vec![77; 9 * 7 * 3] };
+    assert!(gray.bicubic(20, 2).values.iter().all(|&v| v == 77));
     let one = Image8 { width: 1, height: 1, values: vec![1, 2, 3] };
     assert_eq!(one.bicubic(2, 1).values, [1, 2, 3, 1, 2, 3]);
 }
 
 #[test]
-fn quantised_rounds_and_clamps() {
-    let image = Image8::quantised(&[-1.0, 0.0, 0.5 / 255.0, 1.0, 2.0, 100.4 / 255.0], 2, 1);
+fn quantized_rounds_and_clamps() {
+    let image = Image8::quantized(&[-1.0, 0.0, 0.5 / 255.0, 1.0, 2.0, 100.4 / 255.0], 2, 1);
     assert_eq!(image.values, [0, 0, 1, 255, 255, 100]);
 }
 

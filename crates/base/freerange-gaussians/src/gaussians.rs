@@ -10,7 +10,7 @@ pub mod channel {
 
     /// Channels per Gaussian.
     pub const COUNT: usize = 14;
-    /// Centre, in world units.
+    /// Center, in world units.
     pub const MEAN: Range<usize> = 0..3;
     /// Natural logarithm of the standard deviation along each local axis, in world units.
     pub const LOG_SCALE: Range<usize> = 3..6;
@@ -18,7 +18,7 @@ pub mod channel {
     pub const ROTATION: Range<usize> = 6..10;
     /// Logit of the opacity.
     pub const LOGIT_OPACITY: usize = 10;
-    /// Colour, in sRGB-encoded units; 0..1 in ordinary clouds, but not clamped.
+    /// Color, in sRGB-encoded units; 0..1 in ordinary clouds, but not clamped.
     pub const COLOR: Range<usize> = 11..14;
     /// What messages call the channels.
     pub const NAMES: [&str; COUNT] = [
@@ -41,14 +41,14 @@ pub mod channel {
 
 /// N Gaussians, row-major `[n, 14]`; see [`channel`] for the columns.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Cloud {
+pub struct Gaussians {
     data: Vec<f32>, // [n, 14]
 }
 
 /// One Gaussian's channels.
 pub(crate) type Row = [f32; channel::COUNT];
 
-impl Cloud {
+impl Gaussians {
     /// Wraps `data`, row-major `[n, 14]`.
     ///
     /// # Panics
@@ -103,7 +103,7 @@ impl Cloud {
         self.data.extend_from_slice(row);
     }
 
-    /// Centre of Gaussian `i`, in world units.
+    /// Center of Gaussian `i`, in world units.
     pub fn mean(&self, i: usize) -> DVec3 {
         mean(self.row(i))
     }
@@ -123,7 +123,7 @@ impl Cloud {
         opacity(self.row(i))
     }
 
-    /// Colour of Gaussian `i`: red, green, blue, sRGB-encoded.
+    /// Color of Gaussian `i`: red, green, blue, sRGB-encoded.
     pub fn color(&self, i: usize) -> DVec3 {
         color(self.row(i))
     }
@@ -133,7 +133,7 @@ impl Cloud {
         covariance(DMat3::from_quat(self.rotation(i)), self.scale(i))
     }
 
-    /// Smallest and largest centre along each axis; `None` without Gaussians.
+    /// Smallest and largest center along each axis; `None` without Gaussians.
     pub fn bounds(&self) -> Option<(DVec3, DVec3)> {
         self.iter()
             .map(mean)
@@ -150,7 +150,7 @@ impl Cloud {
         out
     }
 
-    /// The same Gaussians in random order: neighbouring rows then are unrelated ("random pairs" of the ablation).
+    /// The same Gaussians in random order: neighboring rows then are unrelated ("random pairs" of the ablation).
     pub fn shuffled(&self, rng: &mut impl Rng) -> Self {
         let mut order: Vec<usize> = (0..self.len()).collect();
         order.shuffle(rng);
@@ -174,8 +174,8 @@ impl Cloud {
         }
     }
 
-    /// Moves every Gaussian by the similarity `x -> scale * rotation * x + translation`: centres, log-scales and
-    /// quaternions change; opacity and colour do not.
+    /// Moves every Gaussian by the similarity `x -> scale * rotation * x + translation`: centers, log-scales and
+    /// quaternions change; opacity and color do not.
     ///
     /// # Panics
     /// If `scale` is not positive and finite, or `rotation` zero or not finite.
@@ -193,7 +193,7 @@ impl Cloud {
     }
 
     /// Gives every quaternion unit length and w >= 0; a zero or non-finite one becomes the identity.
-    /// Generated clouds need this after denormalisation.
+    /// Generated clouds need this after denormalization.
     pub fn canonicalize_rotations(&mut self) {
         for row in self.iter_mut() {
             let unit = canonical(rotation(row));
@@ -202,7 +202,7 @@ impl Cloud {
     }
 }
 
-impl<'a> IntoIterator for &'a Cloud {
+impl<'a> IntoIterator for &'a Gaussians {
     type Item = &'a [f32; channel::COUNT];
     type IntoIter = std::slice::Iter<'a, [f32; channel::COUNT]>;
 
@@ -268,9 +268,9 @@ mod tests {
     use super::*;
     use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 
-    fn example(n: usize, seed: u64) -> Cloud {
+    fn example(n: usize, seed: u64) -> Gaussians {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        Cloud::from_rows((0..n * channel::COUNT).map(|_| rng.random_range(-2.0..2.0)).collect())
+        Gaussians::from_rows((0..n * channel::COUNT).map(|_| rng.random_range(-2.0..2.0)).collect())
     }
 
     #[test]
@@ -315,7 +315,7 @@ mod tests {
         let shuffled = cloud.shuffled(&mut ChaCha8Rng::seed_from_u64(7));
         assert_eq!(shuffled, cloud.shuffled(&mut ChaCha8Rng::seed_from_u64(7)));
         assert_ne!(shuffled, cloud);
-        let sorted = |c: &Cloud| {
+        let sorted = |c: &Gaussians| {
             let mut rows: Vec<_> = c.iter().map(|r| r.map(f32::to_bits)).collect();
             rows.sort_unstable();
             rows
@@ -336,10 +336,10 @@ mod tests {
     }
 
     #[test]
-    fn bounds_hold_the_centres() {
+    fn bounds_hold_the_centers() {
         let cloud = example(30, 5);
         let (lo, hi) = cloud.bounds().unwrap();
         assert!((0..30).all(|i| cloud.mean(i).cmpge(lo).all() && cloud.mean(i).cmple(hi).all()));
-        assert!(Cloud::default().bounds().is_none());
+        assert!(Gaussians::default().bounds().is_none());
     }
 }

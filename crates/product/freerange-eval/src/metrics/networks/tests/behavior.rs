@@ -33,7 +33,7 @@ fn picture(phase: f32) -> Vec<f32> {
     out
 }
 
-fn colour_shift(image: &[f32], by: f32) -> Vec<f32> {
+fn color_shift(image: &[f32], by: f32) -> Vec<f32> {
     image.iter().map(|v| (v + by).clamp(0.0, 1.0)).collect()
 }
 
@@ -67,7 +67,7 @@ fn blur(image: &[f32], times: usize) -> Vec<f32> {
 /// The changes, weak and strong.
 fn changes(image: &[f32]) -> [(&'static str, Vec<f32>, Vec<f32>); 3] {
     [
-        ("colour", colour_shift(image, 0.02), colour_shift(image, 0.1)),
+        ("color", color_shift(image, 0.02), color_shift(image, 0.1)),
         ("shift", pixel_shift(image, 1), pixel_shift(image, 4)),
         ("blur", blur(image, 1), blur(image, 6)),
     ]
@@ -108,7 +108,7 @@ fn fid_grows_with_the_change() {
     let network = Inception::build(&mut Random, &device()).unwrap();
     let truths: Vec<Vec<f32>> = (0..4).map(|i| picture(i as f32)).collect();
     let statistics = |images: &[Vec<f32>]| {
-        let images: Vec<Image8> = images.iter().map(|v| Image8::quantised(v, SIDE, SIDE)).collect();
+        let images: Vec<Image8> = images.iter().map(|v| Image8::quantized(v, SIDE, SIDE)).collect();
         let mut out = FeatureStatistics::new(Inception::WIDTH);
         inception_features(&network, &images, &device()).iter().for_each(|f| out.add(f).unwrap());
         out
@@ -132,7 +132,7 @@ fn dreamsim_grows_with_the_change() {
     for (label, branches) in [("dino", 1), ("ensemble", 3)] {
         let network = super::dreamsim::load(&folder, &folder.join(format!("{label}_lora")), branches).unwrap();
         let truth = picture(0.0);
-        let embed = |image: &[f32]| network.embed(&[Image8::quantised(image, SIDE, SIDE)]).remove(0);
+        let embed = |image: &[f32]| network.embed(&[Image8::quantized(image, SIDE, SIDE)]).remove(0);
         let distance = |image: &[f32]| 1.0 - cosine_similarity(&embed(image), &embed(&truth));
         assert!(distance(&truth).abs() < 1e-10, "{label}: {}", distance(&truth));
         for (name, weak, strong) in changes(&truth) {
