@@ -67,7 +67,9 @@ mod tests {
         let up = DVec3::new(0.3, -0.9, 0.2).normalize();
         write_gaussians(&cloud, &folder.join("b.ply"), up).unwrap();
         let loaded = read(&folder.join("b.ply"), Frames::default()).unwrap();
-        assert!(loaded.frame.up().distance(up) < 1e-8 && loaded.splats.cloud.rows() == cloud.rows());
+        let same = &loaded.splats.cloud;
+        assert!(loaded.frame.up().distance(up) < 1e-8, "{:?}", loaded.frame.up());
+        assert!((0..4).all(|i| same.mean(i) == cloud.mean(i)), "not turned");
         let of = |name: &str, up| write_gaussians(&cloud, &folder.join(name), up).unwrap_err();
         assert!(matches!(of("a.ply", DVec3::ZERO), Error::Input { field, .. } if field == "up"));
         assert!(matches!(of("a.txt", DVec3::Z), Error::Gaussians(_)));
