@@ -101,7 +101,7 @@ fn two_shards_killed_ten_times_equal_one_run() {
     let (whole_path, killed_path) = (place(&whole), place(&killed));
     let make =
         ["data", "generate", "--objects", "60", "--objects-per-shard", "8", "--resolution", "96", "--workers", "1"];
-    let make = with(&make, &["--depths", "8,10", "--min-psnr", "0", "-o"]);
+    let make = with(&make, &["--views", "8", "--fits", "0", "--depths", "8,10", "--min-psnr", "0", "-o"]);
     said(&with(&make, &[&whole_path]));
 
     // However slow or busy the machine is: what is counted is objects, not time.

@@ -123,7 +123,7 @@ pub fn position_embedding(rows: usize, columns: usize, features: usize) -> Vec<f
 /// Published weights of a frozen encoder.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct EncoderWeights {
-    /// What they are known by: see [`Dinov2Config::weights`](freerange_model::Dinov2Config::weights).
+    /// What they are known by: see [`Dinov2Config::weights`](crate::Dinov2Config::weights).
     pub name: String,
     /// Where they lie.
     pub folder: PathBuf,
