@@ -66,7 +66,14 @@ fn check(name: &str, run: impl Fn(&mut Random, Way) -> Vec<Vec<f32>>) {
         let found = run(&mut Random::new(device), Way::Fused(compute));
         assert_eq!(found.len(), truth.len());
         for (i, (found, truth)) in found.iter().zip(&truth).enumerate() {
-            assert_close(&format!("{name} on {device:?} in {compute:?}, {i}"), found, truth, tolerances[i.min(1)]);
+            let what = format!("{name} on {device:?} in {compute:?}, {i}");
+            // Of one token a gradient is nothing but what rounding leaves, which is each device's own.
+            match truth.iter().all(|v| v.abs() < 1e-12) {
+                true => {
+                    assert!(found.len() == truth.len() && found.iter().all(|v| v.abs() < 1e-6), "{what}: {found:?}")
+                }
+                false => assert_close(&what, found, truth, tolerances[i.min(1)]),
+            }
         }
     };
     for device in devices() {
