@@ -292,7 +292,7 @@ mod tests {
     /// `tiny.toml` says how the shipped checkpoint is made: it has its architecture, and means the same in use.
     #[test]
     fn tiny_is_what_ships() {
-        let root = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../.."));
+        let root = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../.."));
         let path = root.join("checkpoints/tiny.safetensors");
         let shipped = freerange_model::Checkpoint::header(&fs::read(&path).unwrap(), &path).unwrap();
         let tiny = TrainConfig::load(Path::new("tiny")).unwrap();
