@@ -3,7 +3,7 @@
 #
 #     tools/release.sh [-o dist] [--target TRIPLE] [--features FEATURES --suffix NAME] [--wheel]
 #
-# One archive: freerange-cli-TARGET-vVERSION.tgz with a folder of that name that holds the program, the licences and the README. Builds with further
+# One archive: freerange-cli-TARGET-vVERSION.tgz with a folder of that name that holds the program, the licenses and the README. Builds with further
 # features get a suffix, by which binstall passes over them: `--features cuda --suffix cuda`. `--wheel` adds the Python wheel. The same program gives the same archive.
 set -euo pipefail
 cd "$(dirname "$0")/.."

@@ -1,8 +1,8 @@
 #!/bin/bash
 # Trains with several processes on one machine, which must have an MPI library (Debian: libmpich-dev mpich, or libopenmpi-dev
 # openmpi-bin) and a freerange built with it: cargo build --release --features mpi
-#   examples/launch/laptop.sh 2 examples/launch/two-lanes.toml -o runs/two
-# Run the same command again to go on, with as many processes as divide `data.lanes`.
+#   examples/launch/laptop.sh 2 examples/launch/two-ranks.toml -o runs/two
+# Run the same command again to go on, with as many processes as divide `data.virtual_ranks`.
 set -euo pipefail
 ranks=${1:?number of processes}
 options=()

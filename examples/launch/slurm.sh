@@ -1,6 +1,6 @@
 #!/bin/bash
 # Trains one model on several nodes, one process per GPU: sbatch slurm.sh CONFIG RUN [OPTIONS]
-# CONFIG needs data.lanes that the number of processes divides. A job that loses a process, a node or its time is put into the
+# CONFIG needs data.virtual_ranks that the number of processes divides. A job that loses a process, a node or its time is put into the
 # queue again and goes on from the last state, as one whose input is refused is not. For other sizes, options of sbatch win:
 #   sbatch --nodes=1 --ntasks-per-node=2 --gpus-per-node=0 --cpus-per-task=1 slurm.sh CONFIG RUN --device cpu
 #SBATCH --job-name=freerange-train

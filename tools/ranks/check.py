@@ -14,7 +14,7 @@ import sys
 import time
 from pathlib import Path
 
-# Four lanes; two stages that differ in batch, depth and parts; objects that come and go; validation.
+# Four virtual ranks; two stages that differ in batch, depth and parts; objects that come and go; validation.
 CONFIG = """
 seed = 5
 model = { image_size = 16, hidden = 16, blocks = 1, heads = 2, registers = 2, gaussians_per_token = 4, time_features = 8, encoder = { kind = "patch", patch_size = 8, channels = 4 } }
@@ -31,7 +31,7 @@ cfg_scale = 1.0
 gradient_size = 16
 
 [data]
-lanes = 4
+virtual_ranks = 4
 window = 12
 fresh = 4
 workers = 1
@@ -139,10 +139,10 @@ difference = worst(run, alone)
 say("1, 2, 1, 4, 2 and 1 ranks in turn, largest relative difference", f"{difference:.1e}")
 assert difference <= TOLERANCE
 
-# A number of ranks that does not divide the lanes, and another program.
+# A number of ranks that does not divide the virtual ranks, and another program.
 done = subprocess.run(command(short, place / "three", 3), capture_output=True, text=True, env=environment, timeout=60)
-assert "data.lanes: expected a multiple of the number of ranks, 3, found 4" in done.stderr, done.stderr
-assert done.returncode == 2 and done.stderr.count("data.lanes") == 1, (done.returncode, done.stderr)
+assert "data.virtual_ranks: expected a multiple of the number of ranks, 3, found 4" in done.stderr, done.stderr
+assert done.returncode == 2 and done.stderr.count("data.virtual_ranks") == 1, (done.returncode, done.stderr)
 
 # Evaluation and many scenes: the same of each object, whoever measured it, and one report.
 objects = ["eval", "--generated", "3", "--generated-size", "32", "--pictures", "none", "--iterations", "10"]

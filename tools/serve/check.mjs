@@ -97,7 +97,7 @@ try {
   await accessible("with photos");
   await picture("understood");
 
-  // A mask is mended: by pointer, by keys.
+  // A mask is edited: by pointer, by keys.
   await click("#photos li:nth-child(2) button:not(.look)");
   await until("document.getElementById('brush').open");
   await wait(200);
@@ -113,8 +113,8 @@ try {
   await click("#paint-add");
   await drag("#paint", 12, 6);
   await click("#paint-save");
-  await until("document.querySelector('#photos li:nth-child(2)').textContent.includes('mended')");
-  check("a mended mask", true, await evaluate("document.querySelector('#photos li:nth-child(2) .small').textContent"));
+  await until("document.querySelector('#photos li:nth-child(2)').textContent.includes("edited")");
+  check("a edited mask", true, await evaluate("document.querySelector('#photos li:nth-child(2) .small').textContent"));
 
   // Go; orbit while it computes; cancel.
   const go = async () => {

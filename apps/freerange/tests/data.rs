@@ -147,7 +147,7 @@ fn meshes_become_shards_views_and_figures() {
     write_pyramid(&folder.path().join("meshes/a.obj"));
     write_pyramid(&folder.path().join("meshes/b.obj"));
     let (meshes, out) = (path("meshes"), path("out"));
-    let build = with(&["data", "build", &meshes, "-o", &out, "--licence", "MIT", "--keep-leaves"], &FAST);
+    let build = with(&["data", "build", &meshes, "-o", &out, "--license", "MIT", "--keep-leaves"], &FAST);
     let report = said(&build);
     assert!(report.contains("2 objects made, 0 there already, 0 failed"), "{report}");
     assert!(report.contains("fit ") && report.contains("at depth 6") && report.contains("peak memory"), "{report}");
@@ -156,7 +156,7 @@ fn meshes_become_shards_views_and_figures() {
     let sheet = path("sheet.png");
     let report: serde_json::Value =
         serde_json::from_str(&said(&["data", "inspect", &out, "--json", "--verify", "--sheet", &sheet])).unwrap();
-    assert_eq!((&report["licences"]["MIT"], &report["complete"]), (&2.into(), &true.into()));
+    assert_eq!((&report["licenses"]["MIT"], &report["complete"]), (&2.into(), &true.into()));
     assert_eq!(image::open(&sheet).unwrap().width(), 2 * (6 * 34 + 2));
 
     // What was rendered can be read as a scene; a lone mesh needs no folder of its own.
@@ -176,8 +176,9 @@ fn meshes_become_shards_views_and_figures() {
     assert!((hours - seconds * 140000.0 / 3600.0).abs() < 1e-6 * hours, "{cost}");
 
     let quality = ["data", "quality", &meshes, "--counts", "16,64", "--leaves", "128", "--iterations", "20"];
-    let table = said(&with(&quality, &["--views", "4", "--resolution", "32", "--polish", "3", "--objects", "1"]));
-    assert!(table.contains("| fit 128 | fit 16 | slice 16 | polished 16 | surface 16 | fit 64"), "{table}");
+    let table =
+        said(&with(&quality, &["--views", "4", "--resolution", "32", "--slice-iterations", "3", "--objects", "1"]));
+    assert!(table.contains("| fit 128 | fit 16 | slice 16 | optimized 16 | surface 16 | fit 64"), "{table}");
 
     let gallery = path("gallery.png");
     said(&["data", "gallery", "--objects", "3", "--columns", "3", "--tile", "24", "-o", &gallery]);
@@ -230,7 +231,7 @@ fn a_list_of_meshes_with_broken_ones_is_worked_off() {
     fs::write(root.join("huge.ply"), ply.replace("vertex 3", "vertex 1000000000")).unwrap();
     fs::write(root.join("cut.glb"), b"glTF\x02\0\0\0\xff\xff\xff\0").unwrap();
     let names = ["good.obj", "nan.ply", "flat.ply", "huge.ply", "cut.glb", "missing.glb"];
-    let lines: Vec<String> = names.iter().map(|n| format!("{{\"path\": \"{n}\", \"licence\": \"CC0-1.0\"}}")).collect();
+    let lines: Vec<String> = names.iter().map(|n| format!("{{\"path\": \"{n}\", \"license\": \"CC0-1.0\"}}")).collect();
     fs::write(root.join("list.jsonl"), lines.join("\n")).unwrap();
     let (list, out) = (root.join("list.jsonl"), root.join("out"));
     let [list, out] = [list, out].map(|p| p.to_str().unwrap().to_owned());

@@ -440,7 +440,7 @@ fn shards_are_evaluated_on_their_view_sets() {
     let place = tempfile::tempdir().unwrap();
     let (data, out) = (text(place.path().join("data")), text(place.path().join("out")));
     let config = place.path().join("config.toml");
-    let text_of = "parent = \"tiny\"\ndata.build = { polish = 0, input_fits = 0 }\ndata.object.cameras.resolution = 24\n\
+    let text_of = "parent = \"tiny\"\ndata.build = { slice_iterations = 0, input_fits = 0 }\ndata.object.cameras.resolution = 24\n\
                    data.shard.min_psnr = 0.0\ndata.object.gaussians = \"surface\"\n";
     fs::write(&config, text_of).unwrap();
     let config = text(config);

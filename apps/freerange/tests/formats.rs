@@ -219,7 +219,7 @@ fn a_model_is_exported_with_its_card() {
     let weights = model.join("model.safetensors");
     let again = folder.path().join("again");
     let done = freerange(&["model", "export", text(&again), "--checkpoint", text(&weights)]);
-    assert_eq!(done.status.code(), Some(2), "a licence is not ours to choose");
+    assert_eq!(done.status.code(), Some(2), "a license is not ours to choose");
     let license = ["--license", "cc-by-4.0"];
     let args = [&["model", "export", text(&again), "--checkpoint", text(&weights)], &license[..]].concat();
     assert!(freerange(&args).status.success());

@@ -19,7 +19,7 @@ pub struct Args {
     #[arg(long, value_name = "FILE", requires = "license")]
     checkpoint: Option<PathBuf>,
     /// Licenses of the model, by their hub names [default: mit,apache-2.0 of the built-in model].
-    #[arg(long, value_name = "LICENCES", value_delimiter = ',', value_parser = parse_license)]
+    #[arg(long, value_name = "LICENSES", value_delimiter = ',', value_parser = parse_license)]
     license: Vec<String>,
     /// Title of the card.
     #[arg(long, default_value = "free-range")]

@@ -3,11 +3,11 @@
 use std::{net::IpAddr, ops::ControlFlow, path::PathBuf, process::Command, sync::Arc, time::Duration};
 
 use freerange::{
-    Camera, Detect, Gaussians, Init, Quality, Reconstructor, View, choose_views, internal::others_show,
+    Camera, Detect, Gaussians, Init, Quality, Reconstructor, View, choose_views, internal::leave_one_out,
     pictures::render_view,
 };
 use freerange_scene::camera::image_ops::to_picture;
-use freerange_scene::estimate::OthersShow;
+use freerange_scene::estimate::LeaveOneOut;
 use freerange_serve::{
     Engine, EngineError, Example, JobOptions, Limits, Outcome, Scene, ServeConfig, ServeError, Server, Step,
 };
@@ -170,8 +170,8 @@ impl Engine for Local {
         choose_views(views, most).map_err(|e| e.to_string())
     }
 
-    fn others_show(&self) -> Option<OthersShow> {
-        Some(others_show)
+    fn leave_one_out(&self) -> Option<LeaveOneOut> {
+        Some(leave_one_out)
     }
 
     fn run(

@@ -177,7 +177,7 @@ fn dry_run(config: &TrainConfig, device: &Device) -> Result<(), CliError> {
     for (number, stage) in config.stages.iter().enumerate() {
         let model = ModelConfig { image_size: stage.image_size, ..config.model.clone() };
         let workload = Workload {
-            batch: stage.at_a_time().min(stage.batch / config.data.lanes),
+            batch: stage.at_a_time().min(stage.batch / config.data.virtual_ranks),
             views,
             gaussians: model.gaussians(stage.depth, views),
         };

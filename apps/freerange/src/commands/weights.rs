@@ -81,7 +81,7 @@ fn list(args: &List) -> Result<(), CliError> {
         let entry = |(set, there): (&freerange_eval::metrics::weights::WeightSet, &bool)| {
             let files: Vec<&str> = set.files.iter().map(|f| f.path).collect();
             serde_json::json!({
-                "name": set.name, "purpose": set.purpose, "licence": set.licence, "files": files, "there": there,
+                "name": set.name, "purpose": set.purpose, "license": set.license, "files": files, "there": there,
             })
         };
         let sets: Vec<_> = SETS.iter().zip(&there).map(entry).collect();
@@ -92,7 +92,7 @@ fn list(args: &List) -> Result<(), CliError> {
     println!("{}", folder.display());
     for (set, there) in SETS.iter().zip(there) {
         let there = if there { "there" } else { "-" };
-        println!("{:16} {there:6} {} ({})", set.name, set.purpose, set.licence);
+        println!("{:16} {there:6} {} ({})", set.name, set.purpose, set.license);
     }
     Ok(())
 }

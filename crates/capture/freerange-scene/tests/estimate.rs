@@ -3,7 +3,7 @@
 use freerange_scene::camera::{Camera, View};
 use freerange_scene::{
     LoadConfig, MaskSource, SceneError,
-    estimate::{Hints, OthersShow, agreement, confirmed, contradictions, masks, overlap, table_faces},
+    estimate::{Hints, LeaveOneOut, agreement, confirmed, contradictions, masks, overlap, table_faces},
     load,
     read::cameras,
 };
@@ -159,7 +159,7 @@ fn what_the_other_views_show_mends_masks() {
         let found = masks(&views, &Hints { others, ..Hints::default() }).unwrap();
         found.alpha.iter().zip(&truth).map(|(a, t)| overlap(&solid(a), t)).collect::<Vec<f64>>()
     };
-    let (before, after) = (shares(None), shares(Some(truth_shown as OthersShow)));
+    let (before, after) = (shares(None), shares(Some(truth_shown as LeaveOneOut)));
     // Three of them are filled by colors and outlines alone.
     assert!(before.iter().any(|s| *s < 0.95), "{before:?}");
     assert!(after.iter().all(|s| *s > 0.98), "{before:?} {after:?}");
@@ -170,9 +170,9 @@ fn masks_stay_as_they_are_where_other_views_show_nothing() {
     let (views, _) = scene();
     let of = |views: &[View], others| masks(views, &Hints { others, ..Hints::default() }).unwrap();
     let plain = of(&views, None);
-    let fails: OthersShow = |_| Err("it is dark".into());
-    let small: OthersShow = |views| Ok(vec![RgbaImage::new(3, 2); views.len()]);
-    let fewer: OthersShow = |views| Ok(views[1..].iter().map(|v| v.image.clone()).collect());
+    let fails: LeaveOneOut = |_| Err("it is dark".into());
+    let small: LeaveOneOut = |views| Ok(vec![RgbaImage::new(3, 2); views.len()]);
+    let fewer: LeaveOneOut = |views| Ok(views[1..].iter().map(|v| v.image.clone()).collect());
     for (others, words) in [(fails, "it is dark"), (small, "expected 8 pictures"), (fewer, "expected 8 pictures")] {
         let found = of(&views, Some(others));
         assert_eq!(found.alpha, plain.alpha);
@@ -180,7 +180,7 @@ fn masks_stay_as_they_are_where_other_views_show_nothing() {
         assert!(told.len() == 1 && told[0].contains(words), "{told:?}");
     }
     // Too few for the others to know anything: they are not asked.
-    let never: OthersShow = |_| panic!("asked");
+    let never: LeaveOneOut = |_| panic!("asked");
     assert_eq!(of(&views[..4], Some(never)).alpha, of(&views[..4], None).alpha);
 }
 

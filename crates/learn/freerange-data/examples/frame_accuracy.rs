@@ -6,7 +6,7 @@
 use std::{ops::ControlFlow, path::Path};
 
 use freerange_data::build::{ObjectConfig, generate_object};
-use freerange_optim::{QuickFitConfig, frame_of, quick_fit};
+use freerange_optim::{InitialFitConfig, frame_of, initial_fit};
 use freerange_scene::camera::{
     FrameConfig, Scene, SelectionConfig, Similarity, View, canonical_from_user, select_views,
 };
@@ -84,7 +84,7 @@ fn errors(views: &[View], moved: &Similarity, truth: impl Fn(&Similarity) -> (DV
     let views = seen_from(views, moved);
     let rough = canonical_from_user(&views, &FrameConfig::default())?.canonical_from_user;
     let views = seen_from(&views, &rough);
-    let cloud = quick_fit(&views, &QuickFitConfig::default(), 0, |_| ControlFlow::Continue(()))?;
+    let cloud = initial_fit(&views, &InitialFitConfig::default(), 0, |_| ControlFlow::Continue(()))?;
     let total = rough.after(moved);
     let off = |total: &Similarity| {
         let (center, radius) = truth(total);

@@ -33,8 +33,8 @@ pub struct Inspection {
     pub depths: Vec<u32>,
     /// Objects per part of the data.
     pub splits: BTreeMap<String, u64>,
-    /// Objects per licence.
-    pub licences: BTreeMap<String, u64>,
+    /// Objects per license.
+    pub licenses: BTreeMap<String, u64>,
     /// Least, median and largest PSNR in dB of the Gaussians before the tree; `None` where not measured.
     pub psnr: Option<[f64; 3]>,
     /// Number of views of the first object; `None` without objects.
@@ -108,7 +108,7 @@ pub fn inspect(store: &Store, verify: bool) -> Result<Inspection, DataError> {
         bytes: manifest.bytes(),
         depths: depths.to_vec(),
         splits: count(manifest.objects().map(|o| format!("{:?}", o.split).to_lowercase())),
-        licences: count(manifest.objects().map(|o| o.licence.clone())),
+        licenses: count(manifest.objects().map(|o| o.license.clone())),
         psnr: at(0).zip(at(psnr.len() / 2)).zip(psnr.last()).map(|((a, b), &c)| [a, b, c]),
         views: object.as_ref().map(|o| o.views.len()),
         image_size: object.and_then(|o| o.views.first().map(|v| [v.camera.width, v.camera.height])),
@@ -120,7 +120,7 @@ pub fn inspect(store: &Store, verify: bool) -> Result<Inspection, DataError> {
     })
 }
 
-/// Counts per licence, for reports.
+/// Counts per license, for reports.
 pub(crate) fn count(values: impl Iterator<Item = String>) -> BTreeMap<String, u64> {
     let mut counts = BTreeMap::new();
     values.for_each(|v| *counts.entry(v).or_default() += 1);

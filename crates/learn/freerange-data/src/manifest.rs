@@ -181,7 +181,7 @@ pub enum Input {
     Files {
         /// Their number.
         objects: u64,
-        /// SHA-256 over the list of items: ids, sources, licences, splits. Contents are hashed per object.
+        /// SHA-256 over the list of items: ids, sources, licenses, splits. Contents are hashed per object.
         sha256: String,
     },
 }
@@ -239,8 +239,8 @@ pub struct ObjectRecord {
     pub offset: u64,
     /// Bytes of its entries.
     pub bytes: u64,
-    /// Licence, as an SPDX identifier.
-    pub licence: String,
+    /// License, as an SPDX identifier.
+    pub license: String,
     /// The part of the data it belongs to.
     pub split: Split,
     /// PSNR of its Gaussians before the tree against held-out views, in dB; `None` where not measured.

@@ -40,7 +40,7 @@ pub struct InputFit {
     pub gaussians: Gaussians,
     /// The same Gaussians, one by one, after gradient steps towards all views of the object: what the fit should have been.
     /// Unlike Gaussians that were made otherwise, they differ from it only where the few views were not enough.
-    pub mended: Gaussians,
+    pub target: Gaussians,
 }
 
 impl InputFit {

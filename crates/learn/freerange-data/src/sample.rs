@@ -4,7 +4,7 @@
 //! |---|---|
 //! | `KEY.json` | [`Metadata`] |
 //! | `KEY.cameras.json` | name, size, intrinsics and pose of every view; see [`CAMERAS`] |
-//! | `KEY.gaussians.safetensors` | `depth_08` f32 `[256, 14]`, ...: the slices, channels as in [`freerange_gaussians::channel`]; `leaves` f32 `[n, 14]`, where they are kept: the Gaussians before the tree; `input_fit_00` f16 `[n, 14]`, ...: quick fits of some of the views; `input_fit_00_mended`, ...: the same Gaussians fitted to all views |
+//! | `KEY.gaussians.safetensors` | `depth_08` f32 `[256, 14]`, ...: the slices, channels as in [`freerange_gaussians::channel`]; `leaves` f32 `[n, 14]`, where they are kept: the Gaussians before the tree; `input_fit_00` f16 `[n, 14]`, ...: quick fits of some of the views; `input_fit_00_target`, ...: the same Gaussians fitted to all views |
 //! | `KEY.000.webp`, ... | the views, 8-bit RGBA with straight alpha, in the order of the cameras; or `KEY.000.png`, ... |
 
 use std::collections::BTreeMap;
@@ -45,8 +45,8 @@ pub struct Metadata {
     pub id: String,
     /// Where it comes from.
     pub source: String,
-    /// Licence of the object, as an SPDX identifier.
-    pub licence: String,
+    /// License of the object, as an SPDX identifier.
+    pub license: String,
     /// SHA-256 of the mesh file; `None` for a generated object.
     pub file_sha256: Option<String>,
     /// What was ignored or repaired when the mesh was read.
@@ -127,9 +127,9 @@ pub(crate) fn view_entry(i: usize, format: ImageFormat) -> String {
 /// Name of the tensor of the Gaussians before the tree.
 const LEAVES: &str = "leaves";
 
-/// Names of the tensors of quick fit `i`: as it is, and mended.
+/// Names of the tensors of quick fit `i`: as it is, and target.
 fn fit_names(i: usize) -> [String; 2] {
-    [format!("input_fit_{i:02}"), format!("input_fit_{i:02}_mended")]
+    [format!("input_fit_{i:02}"), format!("input_fit_{i:02}_target")]
 }
 
 fn tensor_name(depth: u32) -> String {
@@ -211,7 +211,7 @@ fn encode_gaussians(object: &Object, leaves: Option<&Gaussians>, place: EntryOfS
         tensors.push((LEAVES.into(), Dtype::F32, leaves.len(), bytes_of(leaves)));
     }
     for (i, fit) in object.input_fits.iter().enumerate() {
-        for (name, cloud) in fit_names(i).into_iter().zip([&fit.gaussians, &fit.mended]) {
+        for (name, cloud) in fit_names(i).into_iter().zip([&fit.gaussians, &fit.target]) {
             let halves: Vec<f16> = cloud.rows().iter().map(|v| f16::from_f32(*v)).collect();
             if let Some(bad) = halves.iter().position(|v| !v.is_finite()) {
                 return Err(place.error("quick fits of numbers that 16 bits hold", cloud.rows()[bad]));
@@ -375,10 +375,10 @@ pub(crate) fn decode_fits(
             let expected = format!("input_fits of 1 to {count} views, by numbers below {count}");
             return Err(place.of(METADATA).error(expected, format!("{views:?}")));
         }
-        let [name, mended] = fit_names(i);
+        let [name, target] = fit_names(i);
         let gaussians = half_cloud(&tensors, &name, None, place)?;
-        let mended = half_cloud(&tensors, &mended, Some(gaussians.len()), place)?;
-        Ok(InputFit { views: views.clone(), gaussians, mended })
+        let target = half_cloud(&tensors, &target, Some(gaussians.len()), place)?;
+        Ok(InputFit { views: views.clone(), gaussians, target })
     };
     views.iter().enumerate().map(fit).collect()
 }

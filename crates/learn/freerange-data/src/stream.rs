@@ -148,12 +148,12 @@ mod tests {
     }
 
     #[test]
-    fn lanes_together_have_every_object() {
-        let mut lanes =
-            [0, 1, 2].map(|lane| Stream::one_of(3, Arc::new(Some(|i| i == 7)), 3 + lane, 3, 1 + 3 * lane as usize));
-        let mut taken: Vec<u64> = lanes.iter_mut().flat_map(|s| [(); 4].map(|()| s.take_next().unwrap().0)).collect();
+    fn virtual_ranks_together_have_every_object() {
+        let mut ranks =
+            [0, 1, 2].map(|rank| Stream::one_of(3, Arc::new(Some(|i| i == 7)), 3 + rank, 3, 1 + 3 * rank as usize));
+        let mut taken: Vec<u64> = ranks.iter_mut().flat_map(|s| [(); 4].map(|()| s.take_next().unwrap().0)).collect();
         assert_eq!(taken[4..8], [4, 10, 13, 16]);
-        assert_eq!(lanes[1].broken(), [7]);
+        assert_eq!(ranks[1].broken(), [7]);
         taken.sort();
         assert_eq!(taken, [3, 4, 5, 6, 8, 9, 10, 11, 12, 13, 14, 16]);
     }

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 
 use freerange_train::{
     TrainError,
-    ranks::{Ranks, Wire},
+    ranks::{AllReduceDtype, Ranks},
 };
 
 /// The processes of an `mpirun`, `srun` or the like.
@@ -101,13 +101,13 @@ impl Ranks for Mpi {
         self.world.size() as usize
     }
 
-    fn sum(&self, flat: Tensor<1>, wire: Wire) -> Result<Tensor<1>, TrainError> {
+    fn sum(&self, flat: Tensor<1>, dtype: AllReduceDtype) -> Result<Tensor<1>, TrainError> {
         let device = flat.device();
         let mut data = flat.into_data();
         let numbers = data.as_mut_slice::<f32>().map_err(|e| TrainError::Ranks { problem: format!("{e:?}") })?;
-        match wire {
-            Wire::F32 => self.world.allreduce_inplace(numbers, ReduceOp::Sum).map_err(failed)?,
-            Wire::Bf16 => self.sum_rounded(numbers)?,
+        match dtype {
+            AllReduceDtype::F32 => self.world.allreduce_inplace(numbers, ReduceOp::Sum).map_err(failed)?,
+            AllReduceDtype::Bf16 => self.sum_rounded(numbers)?,
         }
         Ok(Tensor::from_data(data, &device))
     }

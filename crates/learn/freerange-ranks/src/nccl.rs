@@ -21,7 +21,7 @@ use cudarc::{
 
 use freerange_train::{
     TrainError,
-    ranks::{Ranks, Wire, agree, gather},
+    ranks::{AllReduceDtype, Ranks, agree, gather},
 };
 
 /// Ranks whose tensors on cards are summed by NCCL, without a copy to the host; all else goes the way of the ranks within.
@@ -79,14 +79,14 @@ impl Ranks for Nccl {
         self.within.world()
     }
 
-    /// In bf16 every hop rounds, where [`Wire::Bf16`] elsewhere rounds twice.
-    fn sum(&self, flat: Tensor<1>, wire: Wire) -> Result<Tensor<1>, TrainError> {
+    /// In bf16 every hop rounds, where [`AllReduceDtype::Bf16`] elsewhere rounds twice.
+    fn sum(&self, flat: Tensor<1>, dtype: AllReduceDtype) -> Result<Tensor<1>, TrainError> {
         if card(&flat.device()).is_err() {
-            return self.within.sum(flat, wire);
+            return self.within.sum(flat, dtype);
         }
-        let sent = match wire {
-            Wire::F32 => flat,
-            Wire::Bf16 => flat.cast(DType::BF16),
+        let sent = match dtype {
+            AllReduceDtype::F32 => flat,
+            AllReduceDtype::Bf16 => flat.cast(DType::BF16),
         };
         let error = Arc::new(OnceLock::new());
         let sum = Dispatch::sum_among(sent.into_dispatch(), self.group.clone(), error.clone());
@@ -256,10 +256,10 @@ mod tests {
         let device = Device::cuda(0);
         let nccl = Nccl::join(Rc::new(Single), &device).unwrap();
         let own: Vec<f32> = (0..1000).map(|i| i as f32 - 499.5).collect();
-        for wire in [Wire::F32, Wire::Bf16] {
+        for dtype in [AllReduceDtype::F32, AllReduceDtype::Bf16] {
             // The first 256 whole numbers and halves are exact in bf16, too.
             let numbers = &own[372..628];
-            let sum = nccl.sum(Tensor::from_floats(numbers, &device), wire).unwrap();
+            let sum = nccl.sum(Tensor::from_floats(numbers, &device), dtype).unwrap();
             assert_eq!(sum.into_data().try_to_vec::<f32>().unwrap(), numbers);
         }
     }

@@ -177,7 +177,7 @@ impl<'a> Rows<'a> {
         let &Common { depth, loss, normalization, inputs, one_sided } = common;
         let symmetry = Symmetry::draw(loss.symmetries, rng);
         let slice = match fit {
-            Some(fit) => &fit.mended,
+            Some(fit) => &fit.target,
             None => object.slice(depth)?,
         };
         let order = symmetry.order(fit.map_or(slice, |fit| &fit.gaussians)); // both have it, one by one

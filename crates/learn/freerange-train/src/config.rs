@@ -100,9 +100,18 @@ impl<M> TrainConfig<M> {
     /// The same without how objects are made, and that.
     pub fn apart(self) -> (TrainConfig, M) {
         let Self { seed, model, data, loss, optimizer, stages, validation, sample, refiner } = self;
-        let DataConfig { shards, allow_incomplete, window, fresh, workers, lanes, statistics_objects, making } = data;
-        let data =
-            DataConfig { shards, allow_incomplete, window, fresh, workers, lanes, statistics_objects, making: () };
+        let DataConfig { shards, allow_incomplete, window, fresh, workers, virtual_ranks, statistics_objects, making } =
+            data;
+        let data = DataConfig {
+            shards,
+            allow_incomplete,
+            window,
+            fresh,
+            workers,
+            virtual_ranks,
+            statistics_objects,
+            making: (),
+        };
         (TrainConfig { seed, model, data, loss, optimizer, stages, validation, sample, refiner }, making)
     }
 }

@@ -301,8 +301,8 @@ mod tests {
         let settings = freerange_diffusion::settings::Settings::of(&shipped.provenance).unwrap();
         assert_eq!((Some(settings.network_views), stage.depth), (Some(tiny.loss.input_views.1), shipped.depth));
         assert_eq!((settings.sample.steps, settings.refiner), (tiny.sample.steps, tiny.refiner));
-        let lanes = TrainConfig::load(&root.join("examples/launch/two-lanes.toml")).unwrap();
-        assert!(lanes.data.lanes == 2 && lanes.data.shards.is_none());
+        let virtual_ranks = TrainConfig::load(&root.join("examples/launch/two-ranks.toml")).unwrap();
+        assert!(virtual_ranks.data.virtual_ranks == 2 && virtual_ranks.data.shards.is_none());
     }
 
     #[test]

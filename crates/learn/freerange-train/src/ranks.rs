@@ -18,7 +18,7 @@ pub(crate) use step::{Agreed, Layout, Own};
 /// How numbers travel between ranks.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Wire {
+pub enum AllReduceDtype {
     /// As they are.
     #[default]
     F32,
@@ -40,7 +40,7 @@ pub trait Ranks {
     ///
     /// # Errors
     /// [`TrainError::Ranks`].
-    fn sum(&self, flat: Tensor<1>, wire: Wire) -> Result<Tensor<1>, TrainError>;
+    fn sum(&self, flat: Tensor<1>, dtype: AllReduceDtype) -> Result<Tensor<1>, TrainError>;
 
     /// Says why and ends the processes of all ranks, with this exit code where the launcher passes it on.
     fn abort(&self, code: u8, why: &dyn fmt::Display) -> !;
@@ -59,7 +59,7 @@ impl Ranks for Single {
         1
     }
 
-    fn sum(&self, flat: Tensor<1>, _: Wire) -> Result<Tensor<1>, TrainError> {
+    fn sum(&self, flat: Tensor<1>, _: AllReduceDtype) -> Result<Tensor<1>, TrainError> {
         Ok(flat)
     }
 
@@ -104,7 +104,7 @@ pub(crate) fn from_first(ranks: &dyn Ranks, own: &[u8]) -> Result<Vec<u8>, Train
 /// The tensor of rank 0; the others' may hold anything of the same length.
 pub(crate) fn tensor_of_first(ranks: &dyn Ranks, own: Tensor<1>) -> Result<Tensor<1>, TrainError> {
     // Not rank 0's own copy there either: adding zeros makes 0 of -0, and all are to have the same bits.
-    ranks.sum(if ranks.rank() == 0 { own } else { own.zeros_like() }, Wire::F32)
+    ranks.sum(if ranks.rank() == 0 { own } else { own.zeros_like() }, AllReduceDtype::F32)
 }
 
 /// [`Ranks::sum`] of a few numbers.
@@ -113,7 +113,7 @@ fn sum_of(ranks: &dyn Ranks, numbers: Vec<f32>) -> Result<Vec<f32>, TrainError> 
     if len == 0 {
         return Ok(numbers);
     }
-    let sum = ranks.sum(Tensor::from_data(TensorData::new(numbers, [len]), &Device::flex()), Wire::F32)?;
+    let sum = ranks.sum(Tensor::from_data(TensorData::new(numbers, [len]), &Device::flex()), AllReduceDtype::F32)?;
     sum.into_data().try_to_vec::<f32>().map_err(|e| TrainError::Ranks { problem: format!("{e:?}") })
 }
 

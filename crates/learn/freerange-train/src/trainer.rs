@@ -3,7 +3,6 @@
 mod among;
 mod encoder;
 mod folder;
-mod lanes;
 mod objects;
 mod open;
 mod report;
@@ -11,6 +10,7 @@ mod state;
 mod step;
 #[cfg(test)]
 mod tests;
+mod virtual_ranks;
 
 use std::{fs::File, ops::ControlFlow, path::PathBuf, rc::Rc};
 
@@ -22,7 +22,7 @@ pub use self::{
     among::{Among, Initial},
     report::{Best, StepReport, Validated},
 };
-use self::{lanes::Lane, state::Progress};
+use self::{state::Progress, virtual_ranks::VirtualRank};
 use crate::{
     TrainError,
     batch::Batch,
@@ -46,8 +46,8 @@ pub struct Trainer {
     progress: Progress,
     photometric: Photometric,
     ranks: Rc<dyn Ranks>,
-    lanes: Vec<Lane>, // of this rank
-    broken: u64,      // objects before those of all streams that could not be read
+    virtual_ranks: Vec<VirtualRank>, // of this rank
+    broken: u64,                     // objects before those of all streams that could not be read
     stop_when: Box<dyn Fn() -> bool>,
     interrupt_when: Box<dyn Fn() -> bool>,
     ahead: Option<Result<Batch, TrainError>>, // of the next step

@@ -354,7 +354,7 @@ fn a_fit_is_refined() {
         .replace("STEPS", "160")
         .replace("warmup = 20", "warmup = 5")
         .replace("batch = 8", "batch = 4")
-        .replace("views = 8", "views = 16\ninput_fits = 1\nquick_fit = { iterations = 60, gaussians = 64, render_size = 32 }")
+        .replace("views = 8", "views = 16\ninput_fits = 1\ninitial_fit = { iterations = 60, gaussians = 64, render_size = 32 }")
         .replace(
             "[model]",
             "[model]\nestimate_channels = true\nobservation_channels = true\nplace_channels = true\npreconditioning = [0.1, 0.1, 0.1, 0.5, 0.5, 0.5, \
@@ -393,7 +393,7 @@ fn a_fit_is_refined() {
         assert_eq!((batch.t.as_slice(), batch.render_weights.as_slice()), ([0.0].as_slice(), [50.0].as_slice()));
         assert!(values(&batch.noise).iter().all(|&e| e == 0.0));
         assert_eq!(values(batch.fits.as_ref().unwrap()), object.input_fits[0].gaussians.rows());
-        assert_eq!(values(&batch.data), object.input_fits[0].mended.rows());
+        assert_eq!(values(&batch.data), object.input_fits[0].target.rows());
     }
     for count in 0..=2 {
         assert!(drawn.iter().any(|batch| batch.estimates == count), "{count} estimates are drawn now and then");
@@ -421,7 +421,7 @@ fn a_fit_is_refined() {
     let own = fit.gaussians.clone();
     let found = refine(&[own.clone(), own.clone()], 3, 0);
     assert_eq!((found.len(), &found[0]), (2, &found[1]), "nothing is random");
-    let [from, to, found] = [&fit.gaussians, &fit.mended, &found[0]].map(|cloud| quality(cloud.rows(), &unseen));
+    let [from, to, found] = [&fit.gaussians, &fit.target, &found[0]].map(|cloud| quality(cloud.rows(), &unseen));
     assert!(
         found > from + 0.4 * (to - from) && to > from + 1.0,
         "fit {from:.2} dB, refined {found:.2} dB, at best {to:.2} dB"

@@ -7,7 +7,7 @@ use freerange_scene::camera::{Camera, View};
 use glam::{DMat4, DVec3};
 
 use crate::{
-    Evidence, FitError, Outline, QuickFitConfig,
+    Evidence, FitError, InitialFitConfig, Outline,
     search::{Hull, OUTLINE, PICTURE, ROUNDS, Search, Symmetry, UNCOVERED, difference, going_on, normals, place},
     views::Targets,
 };
@@ -69,13 +69,13 @@ pub struct FoundAxis {
 const PLACED: usize = 8;
 
 /// How many steps [`find_axis`] tells of.
-pub fn axis_steps(config: &QuickFitConfig) -> usize {
+pub fn axis_steps(config: &InitialFitConfig) -> usize {
     config.iterations + ROUNDS * going_on(config).iterations
 }
 
 /// The axis about which an object may be turned and keeps its outlines, as far as photos of it tell: none where they contradict it by more than
 /// `most` (see [`FoundAxis::contradiction`]), or no axis suits their outlines. Colors need not be the same all around. `views` lie in the
-/// canonical frame, and may all be from one side; `own` is a [`quick_fit`](crate::quick_fit) of them.
+/// canonical frame, and may all be from one side; `own` is a [`initial_fit`](crate::initial_fit) of them.
 ///
 /// What lies within all outlines, and within all turned ones, has to fill the outlines. Axes through the middle of the hull, in all directions,
 /// fifteen degrees apart: those that leave most of the outlines filled are moved to where they leave more. The best of them is moved to where that
@@ -87,7 +87,7 @@ pub fn axis_steps(config: &QuickFitConfig) -> usize {
 pub fn find_axis(
     views: &[View],
     own: &Gaussians,
-    config: &QuickFitConfig,
+    config: &InitialFitConfig,
     most: f64,
     seed: u64,
     mut progress: impl FnMut(usize) -> ControlFlow<()>,
@@ -182,7 +182,7 @@ mod tests {
         cameras(4, 64, 0.3).iter().map(|c| photograph(cloud, c)).collect()
     }
 
-    const QUICK: QuickFitConfig = QuickFitConfig { iterations: 120, gaussians: 150, render_size: 64 };
+    const QUICK: InitialFitConfig = InitialFitConfig { iterations: 120, gaussians: 150, render_size: 64 };
 
     #[test]
     fn turned_views_are_views_of_the_turned_object() {
@@ -234,7 +234,7 @@ mod tests {
 
     #[test]
     fn the_search_is_told_of_and_ends_where_it_is_told_to() {
-        let config = QuickFitConfig { iterations: 7, gaussians: 30, render_size: 32 };
+        let config = InitialFitConfig { iterations: 7, gaussians: 30, render_size: 32 };
         let views = photos(&vase(false));
         let mut told = Vec::new();
         let own = own(&views, &config);

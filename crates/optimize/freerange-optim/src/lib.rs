@@ -19,12 +19,12 @@ mod fit;
 mod frame;
 mod hold;
 mod init;
+mod initial;
 mod mcmc;
 pub mod meshing;
 mod mirror;
 mod objective;
 mod quality;
-mod quick;
 mod refine;
 mod search;
 #[cfg(test)]
@@ -36,9 +36,9 @@ pub use config::{Background, FitConfig, HoldConfig, Rates, RefineConfig};
 pub use error::FitError;
 pub use fit::fit;
 pub use frame::frame_of;
+pub use initial::{InitialFitConfig, initial_fit, tree_slice};
 pub use mirror::{FoundMirror, Mirror, find_mirror, mirror_steps, mirrored};
 pub use quality::{over_white, psnr_over_white, render_over_white};
-pub use quick::{QuickFitConfig, quick_fit, tree_slice};
 pub use refine::refine;
 pub use views::{Evidence, Outline};
 

@@ -10,7 +10,7 @@ use image::imageops::flip_horizontal;
 use rayon::prelude::*;
 
 use crate::{
-    FitError, QuickFitConfig,
+    FitError, InitialFitConfig,
     search::{Hull, OUTLINE, PICTURE, ROUNDS, Search, Symmetry, UNCOVERED, difference, going_on, normals, place},
     views::Targets,
 };
@@ -96,13 +96,13 @@ const PLACED: usize = 6;
 const FITTED: usize = 3;
 
 /// How many steps [`find_mirror`] tells of.
-pub fn mirror_steps(config: &QuickFitConfig) -> usize {
+pub fn mirror_steps(config: &InitialFitConfig) -> usize {
     FITTED * (config.iterations + ROUNDS * going_on(config).iterations)
 }
 
 /// The plane about which an object is its own mirror image, as far as photos of it tell: none where they doubt every plane by more than `most`
 /// (see [`FoundMirror::doubt`]), no plane suits their outlines, or they are all from one side. Of several the one that they doubt least.
-/// `views` lie in the canonical frame; `own` is a [`quick_fit`](crate::quick_fit) of them.
+/// `views` lie in the canonical frame; `own` is a [`initial_fit`](crate::initial_fit) of them.
 ///
 /// Three questions, each asked of fewer planes than the one before. Can what lies within all outlines and within all mirrored ones fill the outlines?
 /// (All directions, fifteen degrees apart, but for those from which mirrored photos share nothing with the photos.) From behind which of these planes does that fit of the photos look most like them? And how much do photos
@@ -114,7 +114,7 @@ pub fn mirror_steps(config: &QuickFitConfig) -> usize {
 pub fn find_mirror(
     views: &[View],
     own: &Gaussians,
-    config: &QuickFitConfig,
+    config: &InitialFitConfig,
     most: f64,
     seed: u64,
     mut progress: impl FnMut(usize) -> ControlFlow<()>,
@@ -278,7 +278,7 @@ mod tests {
 
     #[test]
     fn what_is_its_own_mirror_image_is_told_from_what_is_not() {
-        let config = QuickFitConfig { iterations: 120, gaussians: 150, render_size: 64 };
+        let config = InitialFitConfig { iterations: 120, gaussians: 150, render_size: 64 };
         let find = |cloud: &Gaussians| {
             find_mirror(&photos(cloud), &own(&photos(cloud), &config), &config, f64::INFINITY, 0, |_| {
                 ControlFlow::Continue(())
@@ -315,7 +315,7 @@ mod tests {
 
     #[test]
     fn the_search_is_told_of_and_ends_where_it_is_told_to() {
-        let config = QuickFitConfig { iterations: 7, gaussians: 30, render_size: 32 };
+        let config = InitialFitConfig { iterations: 7, gaussians: 30, render_size: 32 };
         let views = photos(&twins(10, 3, &MIRROR));
         let mut told = Vec::new();
         let own = own(&views, &config);

@@ -9,7 +9,7 @@ use freerange_scene::camera::Camera;
 use glam::DVec3;
 use rayon::prelude::*;
 
-use crate::{Evidence, FitError, FitProgress, QuickFitConfig, quick::polish, quick_fit, views::Targets};
+use crate::{Evidence, FitError, FitProgress, InitialFitConfig, initial::continue_fit, initial_fit, views::Targets};
 
 /// Longest side, in pixels, of the outlines that symmetries are judged by.
 pub(crate) const OUTLINE: u32 = 64;
@@ -51,7 +51,7 @@ impl<P: FnMut(usize) -> ControlFlow<()>> Search<'_, P> {
         &mut self,
         start: Option<&Gaussians>,
         seen: impl Into<Evidence<'b>>,
-        config: &QuickFitConfig,
+        config: &InitialFitConfig,
     ) -> Result<Option<Gaussians>, FitError> {
         let mut ended = false;
         let tell = |p: &FitProgress<'_>| {
@@ -60,8 +60,8 @@ impl<P: FnMut(usize) -> ControlFlow<()>> Search<'_, P> {
             told
         };
         let cloud = match start {
-            None => quick_fit(seen, config, self.seed, tell)?,
-            Some(start) => polish(start, seen, config, self.seed, tell)?,
+            None => initial_fit(seen, config, self.seed, tell)?,
+            Some(start) => continue_fit(start, seen, config, self.seed, tell)?,
         };
         self.done += config.iterations;
         Ok((!ended).then_some(cloud))
@@ -85,8 +85,8 @@ impl<P: FnMut(usize) -> ControlFlow<()>> Search<'_, P> {
 }
 
 /// A third of a fit.
-pub(crate) fn going_on(config: &QuickFitConfig) -> QuickFitConfig {
-    QuickFitConfig { iterations: config.iterations.div_ceil(ROUNDS), ..config.clone() }
+pub(crate) fn going_on(config: &InitialFitConfig) -> InitialFitConfig {
+    InitialFitConfig { iterations: config.iterations.div_ceil(ROUNDS), ..config.clone() }
 }
 
 /// The symmetry near `start` of the least `value`, and that. Moves begin with `reach` and end with `least`.

@@ -1,7 +1,7 @@
 //! Fits of small scenes that the rasterizer itself has drawn, and what all tests share.
 
 use crate::*;
-use crate::{quick::polish, views::Targets};
+use crate::{initial::continue_fit, views::Targets};
 use freerange_gaussians::{Gaussians, channel};
 use freerange_raster::{RasterConfig, render};
 use freerange_scene::camera::{Camera, View};
@@ -83,8 +83,8 @@ fn outlines_share_pictures() {
 }
 
 /// What searches for symmetries begin with.
-pub(crate) fn own(views: &[View], config: &QuickFitConfig) -> Gaussians {
-    quick_fit(views, config, 0, go).unwrap()
+pub(crate) fn own(views: &[View], config: &InitialFitConfig) -> Gaussians {
+    initial_fit(views, config, 0, go).unwrap()
 }
 
 /// Views of the cloud from all around.
@@ -169,21 +169,21 @@ fn a_fit_can_start_from_a_cloud_and_stop_early() {
 }
 
 #[test]
-fn polishing_keeps_the_number_and_comes_nearer() {
+fn continuing_keeps_the_number_and_comes_nearer() {
     let scene = ball(30, 4);
     let views = ring(4, 32, &scene);
     let rough = disturbed(&scene, 9);
     let mut steps = 0;
-    let config = QuickFitConfig { iterations: 150, gaussians: 7, render_size: 32 };
-    let polished = polish(&rough, &views, &config, 3, |p| {
+    let config = InitialFitConfig { iterations: 150, gaussians: 7, render_size: 32 };
+    let continued = continue_fit(&rough, &views, &config, 3, |p| {
         steps = p.steps;
         ControlFlow::Continue(())
     })
     .unwrap();
-    assert_eq!((steps, polished.len()), (150, 30));
-    let [before, after] = [&rough, &polished].map(|cloud| psnr(cloud, &views));
-    assert!(after > before + 2.0, "{before} dB, polished {after} dB");
-    assert!(polish(&Gaussians::default(), &views, &config, 3, go).is_err());
+    assert_eq!((steps, continued.len()), (150, 30));
+    let [before, after] = [&rough, &continued].map(|cloud| psnr(cloud, &views));
+    assert!(after > before + 2.0, "{before} dB, continued {after} dB");
+    assert!(continue_fit(&Gaussians::default(), &views, &config, 3, go).is_err());
 }
 
 /// A cloud as a generator might give it: right on the whole, wrong in detail.

@@ -36,7 +36,7 @@ pub struct Board {
     engine: Arc<dyn Engine>,
     table: Mutex<Table>,
     changed: Condvar,
-    mending: Mutex<()>,
+    editing: Mutex<()>,
     stopping: AtomicBool,
     pub metrics: Metrics,
 }
@@ -74,7 +74,7 @@ impl Board {
             engine,
             table: Mutex::default(),
             changed: Condvar::new(),
-            mending: Mutex::new(()),
+            editing: Mutex::new(()),
             stopping: AtomicBool::new(false),
             metrics: Metrics::new(),
         };

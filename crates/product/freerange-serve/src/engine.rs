@@ -4,7 +4,7 @@ use std::ops::ControlFlow;
 
 use freerange_gaussians::Gaussians;
 use freerange_scene::camera::{Camera, FrameConfig, View};
-use freerange_scene::estimate::OthersShow;
+use freerange_scene::estimate::LeaveOneOut;
 use image::RgbaImage;
 use serde::{Deserialize, Serialize};
 
@@ -19,8 +19,8 @@ pub trait Engine: Send + Sync + 'static {
     /// A sentence for the user, where the cameras do not allow a choice.
     fn choose(&self, views: &[View]) -> Result<Vec<usize>, String>;
 
-    /// What masks that are estimated are mended with; none: they are not.
-    fn others_show(&self) -> Option<OthersShow>;
+    /// What masks that are estimated are edited with; none: they are not.
+    fn leave_one_out(&self) -> Option<LeaveOneOut>;
 
     /// Reconstructs. `tell` hears of every step, and ends the work by `ControlFlow::Break`.
     ///

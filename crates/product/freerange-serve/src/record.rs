@@ -20,7 +20,7 @@ pub enum State {
     Uploading,
     /// Its photos are read.
     Reading,
-    /// It can be looked at and mended, and waits for someone to press go.
+    /// It can be looked at and edited, and waits for someone to press go.
     Ready,
     /// It waits for its turn.
     Queued,
@@ -56,7 +56,7 @@ impl State {
         matches!(self, Self::Uploading | Self::Reading | Self::Ready | Self::Queued | Self::Running)
     }
 
-    /// Whether its scene may be mended and computed.
+    /// Whether its scene may be edited and computed.
     pub fn may_go(self) -> bool {
         matches!(self, Self::Ready | Self::Done | Self::Failed | Self::Cancelled | Self::Interrupted)
     }

@@ -113,7 +113,7 @@ fn answer(site: &Site, request: &mut Request) -> Answer {
         ("GET", ["jobs", id, "samples", name]) => sample(board, id, name),
         ("PUT", ["jobs", id, "masks", k]) => {
             let png = request.body(MASK)?;
-            let covers = board.mend(id, number(k, PHOTOS)?, &png)?;
+            let covers = board.edit_mask(id, number(k, PHOTOS)?, &png)?;
             Ok(Response::json(&json!({ "covers": covers })))
         }
         ("GET", ["jobs", id, what, name]) if ["photos", "views"].contains(what) => {

@@ -1,4 +1,4 @@
-//! From a client's files to what is computed with: read once, kept as pictures and one JSON file, and mended there.
+//! From a client's files to what is computed with: read once, kept as pictures and one JSON file, and edited there.
 
 use std::{
     fs,
@@ -141,7 +141,7 @@ pub fn prepare(
         masks: options.masks()?,
         invert_masks: options.invert_masks,
         max_side: limits.side,
-        hints: Hints { others: engine.others_show(), ..Hints::default() },
+        hints: Hints { others: engine.leave_one_out(), ..Hints::default() },
     };
     let config = SceneConfig { cameras, photos, up: options.up()? };
     let freerange_scene::Scene { cameras, mut loaded, frame, notes } =
@@ -177,7 +177,7 @@ pub fn prepare(
             "width": c.width, "height": c.height, "fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy,
             "world_to_camera": c.world_to_camera.to_cols_array(),
         });
-        told["mended"] = false.into();
+        told["edited"] = false.into();
     }
     Ok(understood)
 }
@@ -222,14 +222,14 @@ pub fn open(folder: &Path) -> Result<Scene, Refusal> {
 
 /// Gives photo number `k` the mask that a client painted: a PNG of the photo's size, whose brightness is the object's share. Returns the share
 /// of the photo that is object.
-pub fn mend(folder: &Path, k: usize, png: &[u8]) -> Result<f64, Refusal> {
+pub fn edit_mask(folder: &Path, k: usize, png: &[u8]) -> Result<f64, Refusal> {
     let path = view_file(folder, k);
     let mut view = picture(&path)?;
     let mask = mask(png, view.dimensions())?;
     let whole = picture(&whole_file(folder, k))?;
     let mut covered = 0u64;
     for ((pixel, photo), Luma([alpha])) in view.pixels_mut().zip(whole.pixels()).zip(mask.pixels()) {
-        // Where nothing was mended, the colors stay as they were cut out.
+        // Where nothing was edited, the colors stay as they were cut out.
         if pixel[3] != *alpha {
             *pixel = match *alpha {
                 0 => Rgba([0; 4]),
@@ -242,7 +242,7 @@ pub fn mend(folder: &Path, k: usize, png: &[u8]) -> Result<f64, Refusal> {
     if covered == 0 {
         return Err(Refusal::new(422, "mask: expected some of the object, found none"));
     }
-    let beside = folder.join("mended.png");
+    let beside = folder.join("edited.png");
     save(&view, &beside)?;
     fs::rename(&beside, &path).map_err(Refusal::own)?;
     Ok(covered as f64 / mask.pixels().len() as f64)

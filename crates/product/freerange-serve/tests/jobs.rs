@@ -102,7 +102,7 @@ fn the_example_becomes_gaussians_while_one_watches() {
 }
 
 #[test]
-fn photos_are_looked_at_and_mended_before_they_are_computed() {
+fn photos_are_looked_at_and_edited_before_they_are_computed() {
     let engine = Fake::quick();
     let server = Running::plain(engine.clone());
     let mut parts = folder("my & bowl/");
@@ -139,7 +139,7 @@ fn photos_are_looked_at_and_mended_before_they_are_computed() {
         assert_eq!(pixel[3], mask.get_pixel(x, y)[0]);
         assert!(x >= 256 || pixel == before.get_pixel(x, y), "where nothing was painted, nothing changes");
     }
-    assert_eq!(server.json(&format!("/jobs/{id}"))["understood"]["views"][1]["mended"], true);
+    assert_eq!(server.json(&format!("/jobs/{id}"))["understood"]["views"][1]["edited"], true);
     for (what, k, bytes) in [
         ("expected some of the object, found none", "1", png(&RgbaImage::from_pixel(512, 512, Rgba([0, 0, 0, 255])))),
         ("512 x 512 pixels, found 511 x 512", "1", png(&RgbaImage::new(511, 512))),
@@ -155,7 +155,7 @@ fn photos_are_looked_at_and_mended_before_they_are_computed() {
     server.until(&id, &["done"]);
     let (names, covered, _) = engine.seen.lock().unwrap()[0].clone();
     assert_eq!(names, ["000", "001", "002", "003"]);
-    assert_eq!(covered[1], wanted, "the mended mask is what is computed with");
+    assert_eq!(covered[1], wanted, "the edited mask is what is computed with");
     assert_eq!(
         covered[0],
         image::open(bowl().join("train/000.png")).unwrap().into_rgba8().pixels().filter(|p| p[3] >= 128).count()

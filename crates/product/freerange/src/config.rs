@@ -6,7 +6,7 @@ use freerange_diffusion::{
 };
 use freerange_gaussians::Gaussians;
 use freerange_model::{Checkpoint, Compute};
-use freerange_optim::QuickFitConfig;
+use freerange_optim::InitialFitConfig;
 use freerange_scene::camera::FrameConfig;
 use serde::{Deserialize, Serialize};
 
@@ -78,7 +78,7 @@ pub struct ProposeConfig {
     /// How many. The optimization begins with several together and is anchored to their mean renders where no photo looks.
     pub count: usize,
     /// Initial fits: of the proposals, and of the object's place in the canonical frame.
-    pub fit: QuickFitConfig,
+    pub fit: InitialFitConfig,
     /// Sampling from noise.
     pub flow: FlowConfig,
 }
@@ -134,7 +134,7 @@ impl PipelineConfig {
     pub(crate) fn preset(checkpoint: &Checkpoint, quality: Quality) -> Result<Self, Error> {
         let Settings { network_views, sample, refiner } = Settings::of(&checkpoint.provenance).lift()?;
         let depth = refiner.as_ref().and_then(|r| r.lod_depth).unwrap_or(checkpoint.depth);
-        let fit = QuickFitConfig { gaussians: 1 << depth.min(16), ..QuickFitConfig::default() };
+        let fit = InitialFitConfig { gaussians: 1 << depth.min(16), ..InitialFitConfig::default() };
         let whole = refiner.is_some();
         let (count, iterations, max_resolution) = match quality {
             _ if !whole => (1, 0, 2 * UNIT),

@@ -8,7 +8,7 @@ pub use crate::{
     checkpoint::{
         checkpoint_bytes, checkpoint_header, checkpoint_sha256, encoder_for_training, find_encoder, load_checkpoint,
     },
-    others::others_show,
+    leave_one_out::leave_one_out,
     reconstructor::network_gaussians,
 };
 

@@ -54,8 +54,8 @@ mod files;
 mod frame;
 #[doc(hidden)]
 pub mod internal;
+mod leave_one_out;
 pub mod machine;
-mod others;
 pub mod pictures;
 pub mod pipeline;
 mod progress;
@@ -74,7 +74,7 @@ pub use frame::{choose_views, to_canonical, to_user};
 pub use freerange_diffusion::sample::{FlowConfig, RefinerConfig, SETTINGS_SCHEMA};
 pub use freerange_gaussians::{Gaussians, RenderMode, Splats};
 pub use freerange_model::Compute;
-pub use freerange_optim::QuickFitConfig;
+pub use freerange_optim::InitialFitConfig;
 pub use freerange_scene::camera::{Camera, CanonicalFrame, FrameConfig, Similarity, Up, View};
 pub use freerange_scene::{
     LoadConfig, Loaded, MaskSource, SceneConfig,

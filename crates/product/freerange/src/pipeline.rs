@@ -4,7 +4,7 @@
 //!    origin with +z up; photos are cropped to the object, and views for the network are chosen.
 //! 2. Symmetry: with up to four photos, a mirror plane adds mirrored photos to the targets, an axis of revolution adds
 //!    rotated silhouettes ([`SymmetryConfig`](crate::SymmetryConfig)).
-//! 3. Propose: some sets of Gaussians, by [initial fits](freerange_optim::quick_fit), by the paper's
+//! 3. Propose: some sets of Gaussians, by [initial fits](freerange_optim::initial_fit), by the paper's
 //!    [`FlowSampler`](freerange_diffusion::sample::FlowSampler), or from the user ([`ProposeConfig`](crate::ProposeConfig)).
 //! 4. Refine: the network corrects each proposal ([`Refiner`](freerange_diffusion::sample::Refiner),
 //!    [`RefinerConfig`](crate::RefinerConfig)).

@@ -11,7 +11,7 @@ use freerange_scene::{
 };
 use freerange_util::Note;
 
-use crate::{Error, choose_views, error::Lift, others::others_show, to_canonical};
+use crate::{Error, choose_views, error::Lift, leave_one_out::leave_one_out, to_canonical};
 
 /// Photos with cameras, read and cut out.
 #[derive(Clone, Debug)]
@@ -51,7 +51,7 @@ impl Scene {
     /// As [`open`](Self::open).
     pub fn load(cameras: Cameras, config: &SceneConfig) -> Result<Self, Error> {
         let mut config = config.clone();
-        config.photos.hints.others = config.photos.hints.others.or(Some(others_show));
+        config.photos.hints.others = config.photos.hints.others.or(Some(leave_one_out));
         let read = freerange_scene::Scene::load(cameras, &config).lift()?;
         Ok(Self { cameras: read.cameras, loaded: read.loaded, frame: read.frame, notes: read.notes })
     }
@@ -83,5 +83,5 @@ impl Scene {
 /// # Errors
 /// If no mask can be found.
 pub fn cut_out(views: &mut [View], hints: &Hints) -> Result<Vec<Note>, Error> {
-    cut(views, &Hints { others: hints.others.or(Some(others_show)), ..*hints }).lift()
+    cut(views, &Hints { others: hints.others.or(Some(leave_one_out)), ..*hints }).lift()
 }

@@ -2,7 +2,7 @@
 
 use burn::tensor::{Device, Distribution, Tensor};
 use freerange_model::{ModelInfo, Workload};
-use freerange_train::ranks::{Ranks, Wire, gather};
+use freerange_train::ranks::{AllReduceDtype, Ranks, gather};
 
 use super::{Args, Part, Printer, timer::Timer};
 use crate::{error::CliError, ranks::Job, runtime};
@@ -33,10 +33,10 @@ fn measure(args: &Args, job: &Job) -> Result<(), CliError> {
     ));
     out.line(&format!("program: freerange {}, commit {}", env!("CARGO_PKG_VERSION"), runtime::commit()));
     out.line(&format!("command: {}", std::env::args().collect::<Vec<_>>().join(" ")));
-    out.header(&["size", "numbers", "wire", "MB", "ms"]);
+    out.header(&["size", "numbers", "dtype", "MB", "ms"]);
     for (size, count) in job.together(counts)? {
-        for (wire, name, bytes) in [(Wire::F32, "f32", 4), (Wire::Bf16, "bf16", 2)] {
-            let seconds = seconds(&*ranks, count, wire, device, args.seconds)?;
+        for (dtype, name, bytes) in [(AllReduceDtype::F32, "f32", 4), (AllReduceDtype::Bf16, "bf16", 2)] {
+            let seconds = seconds(&*ranks, count, dtype, device, args.seconds)?;
             let cells = [
                 size.to_owned(),
                 count.to_string(),
@@ -58,7 +58,13 @@ fn numbers(size: &str) -> Result<usize, CliError> {
 }
 
 /// Median seconds of a sum, the same number of times on all ranks, which begin each time together.
-fn seconds(ranks: &dyn Ranks, count: usize, wire: Wire, device: &Device, wanted: f64) -> Result<f64, CliError> {
+fn seconds(
+    ranks: &dyn Ranks,
+    count: usize,
+    dtype: AllReduceDtype,
+    device: &Device,
+    wanted: f64,
+) -> Result<f64, CliError> {
     let own = Tensor::<1>::random([count], Distribution::Default, device);
     let timer = Timer { device: device.clone(), seconds: wanted };
     let once = || {
@@ -66,7 +72,7 @@ fn seconds(ranks: &dyn Ranks, count: usize, wire: Wire, device: &Device, wanted:
         timer.wait()?;
         gather(ranks, &[])?;
         let begin = std::time::Instant::now();
-        let sum = ranks.sum(flat, wire)?;
+        let sum = ranks.sum(flat, dtype)?;
         timer.wait()?;
         drop(sum);
         Ok::<_, CliError>(begin.elapsed().as_secs_f64())

@@ -81,7 +81,7 @@ pub(super) fn load(size: &str) -> Result<TrainConfig, CliError> {
         (encoder.weights, encoder.random) = (None, true);
     }
     config.data.making.object.gaussians = GaussianSource::Surface;
-    config.data.making.object.polish = 0;
+    config.data.making.object.slice_iterations = 0;
     let most = config.stages.iter().map(|s| 1usize << s.depth).max().unwrap_or(1);
     config.data.making.object.surface.points = config.data.making.object.surface.points.max(2 * most);
     config.data.making.object.views = config.loss.input_views.1.max(VIEWS) + config.loss.held_views;

@@ -44,11 +44,11 @@ pub struct GenerateArgs {
 pub struct InputArgs {
     /// Folder of .glb, .gltf, .obj and .ply files, one such file, or a list (.jsonl).
     ///
-    /// Lines of a list: {"path": "chair.glb", "licence": "CC-BY-4.0", "source": "...", "id": "...", "split": "train"}.
+    /// Lines of a list: {"path": "chair.glb", "license": "CC-BY-4.0", "source": "...", "id": "...", "split": "train"}.
     input: PathBuf,
     /// License of the meshes (SPDX), for files whose list entry has none.
     #[arg(long, default_value = "unknown")]
-    licence: String,
+    license: String,
     /// Prefix of each file's path in its metadata, for files whose list entry has no source.
     #[arg(long, default_value = "")]
     source: String,
@@ -64,8 +64,8 @@ impl InputArgs {
     pub fn items(&self) -> Result<Items, CliError> {
         let list = self.input.extension().is_some_and(|e| e == "jsonl");
         Ok(match list {
-            true => Items::list(&self.input, &self.source, &self.licence)?,
-            false => Items::find(&self.input, &self.source, &self.licence)?,
+            true => Items::list(&self.input, &self.source, &self.license)?,
+            false => Items::find(&self.input, &self.source, &self.license)?,
         })
     }
 }
@@ -102,7 +102,7 @@ pub struct Settings {
     iterations: Option<usize>,
     /// Optimization steps on each slice; 0 keeps the tree's slices [default: the configuration's].
     #[arg(long)]
-    polish: Option<usize>,
+    slice_iterations: Option<usize>,
     /// Initial fits of a few views, stored with each object [default: the configuration's].
     #[arg(long, value_name = "N")]
     fits: Option<usize>,
@@ -149,7 +149,7 @@ impl Settings {
         object.views = self.views.unwrap_or(object.views);
         object.cameras.resolution = self.resolution.unwrap_or(object.cameras.resolution);
         object.fit.iterations = self.iterations.unwrap_or(object.fit.iterations);
-        object.polish = self.polish.unwrap_or(object.polish);
+        object.slice_iterations = self.slice_iterations.unwrap_or(object.slice_iterations);
         object.input_fits = self.fits.unwrap_or(object.input_fits);
         config.shard.leaves |= self.keep_leaves;
         config.shard.objects_per_shard = self.objects_per_shard.unwrap_or(config.shard.objects_per_shard);

@@ -52,7 +52,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         report.bytes as f64 / 1e6,
         if report.complete { "complete" } else { "unfinished" }
     );
-    println!("parts: {}; licenses: {}", counts(&report.splits), counts(&report.licences));
+    println!("parts: {}; licenses: {}", counts(&report.splits), counts(&report.licenses));
     if let (Some(views), Some([w, h]), Some(sets)) = (report.views, report.image_size, report.evaluation) {
         let sets = if sets { "with" } else { "too few for" };
         println!("depths {:?}; {views} views of {w} x {h} pixels, {sets} sets for evaluation", report.depths);

@@ -50,13 +50,13 @@ pub fn run(args: &Args) -> Result<(), CliError> {
 
 fn print(table: &[Quality], counts: &[usize]) {
     let Some(first) = table.first() else { return };
-    let polished = first.by_count.iter().any(|c| c.polished.is_some());
+    let optimized = first.by_count.iter().any(|c| c.optimized.is_some());
     let mut columns = vec![format!("fit {}", first.gaussians)];
     for n in counts {
         columns.push(format!("fit {n}"));
         columns.push(format!("slice {n}"));
-        if polished {
-            columns.push(format!("polished {n}"));
+        if optimized {
+            columns.push(format!("optimized {n}"));
         }
         columns.push(format!("surface {n}"));
     }
@@ -71,7 +71,7 @@ fn print(table: &[Quality], counts: &[usize]) {
         let mut values = vec![q.full];
         for c in &q.by_count {
             values.extend([c.fit, c.slice]);
-            values.extend(c.polished);
+            values.extend(c.optimized);
             values.push(c.surface);
         }
         row(&q.id, &values);

@@ -1,7 +1,7 @@
 //! Whether poses that an engine found can be right. Reprojection errors do not tell: poses that are off by a third of a turn, on a mug whose
 //! pattern repeats, have as small ones.
 
-use freerange::{choose_views, internal::others_show, to_canonical};
+use freerange::{choose_views, internal::leave_one_out, to_canonical};
 use freerange_scene::camera::{Camera, Lens, cameras_up, nearest_point};
 use freerange_scene::{LoadConfig, Loaded, Scene, SceneConfig, SceneError, inspect::view_warnings, read::Cameras};
 use glam::{DMat3, DVec3};
@@ -188,7 +188,7 @@ impl Judgement {
     }
 
     fn predict(&mut self, loaded: &Loaded) {
-        let shown = match others_show(&loaded.views) {
+        let shown = match leave_one_out(&loaded.views) {
             Ok(shown) => shown,
             Err(e) => {
                 self.refused.push(format!("no picture of the object comes of these poses ({e})"));

@@ -4,16 +4,16 @@
 //! of the photos is not the object; objects stand on something flat, whose look is known from the views that see past the object
 //! (`plane`); colors of object and background are mixtures of Gaussians, common to all views, and each view is cut at least cost
 //! (GrabCut, Rother et al. 2004); what no other view confirms is not the object (`hull`). These take turns until nothing changes. Then,
-//! where there is something that makes Gaussians of views ([`OthersShow`]), each mask is mended with what all the others make of its view:
+//! where there is something that makes Gaussians of views ([`LeaveOneOut`]), each mask is refined with what all the others make of its view:
 //! print in the table's color, a foot in its own shadow, the opening of a handle. Work is done on small pictures, and only the outline is
 //! cut again on larger ones.
 
 mod confirm;
 mod evidence;
 mod hull;
+mod leave_one_out;
 mod mask;
 mod maxflow;
-mod mend;
 mod mixture;
 mod odds;
 mod picture;
@@ -24,15 +24,15 @@ mod shown;
 pub use confirm::confirmed;
 pub use evidence::{Compared, Evidence};
 pub use hull::overlap;
-pub use mend::OthersShow;
+pub use leave_one_out::LeaveOneOut;
 
 use crate::SceneError;
 use crate::camera::View;
 use glam::{DVec3, Vec3};
 use hull::{Floor, Hull, reaches_border};
 use image::RgbaImage;
+use leave_one_out::{LEAST_VIEWS, OUTSIDE_HULL, ROUNDS};
 use mask::{enlarged, grown, shrunk, smooth, soft, tidy};
-use mend::{LEAST_TO_MEND, MENDING, OUTSIDE_MENDING};
 use mixture::Mixture;
 use odds::{cut, odds};
 use picture::Picture;
@@ -69,8 +69,8 @@ const BACKGROUND: usize = 8;
 /// What is known beforehand.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Hints {
-    /// What masks are mended with; none: they are not.
-    pub others: Option<OthersShow>,
+    /// What masks are refined with; none: they are not.
+    pub others: Option<LeaveOneOut>,
     /// The object's middle, in the world.
     pub center: Option<DVec3>,
     /// The radius of a sphere about it that holds the object.
@@ -149,12 +149,12 @@ pub fn unjudged(views: &[View], hints: &Hints) -> Result<Estimate, SceneError> {
     let mut small = stage.take_turns()?;
     // Poses are judged by what photos say themselves.
     let evidence = stage.evidence(&small);
-    if let Some(others) = hints.others.filter(|_| views.len() >= LEAST_TO_MEND) {
-        for _ in 0..MENDING {
+    if let Some(others) = hints.others.filter(|_| views.len() >= LEAST_VIEWS) {
+        for _ in 0..ROUNDS {
             match stage.shown_by_others(views, &small, others) {
-                Ok(shown) => small = stage.mend(&small, shown)?,
+                Ok(shown) => small = stage.refine(&small, shown)?,
                 Err(reason) => {
-                    notes.push(format!("masks are not mended with what other views show: {reason}"));
+                    notes.push(format!("masks are not refined with what other views show: {reason}"));
                     break;
                 }
             }
@@ -203,7 +203,7 @@ struct Masks {
     background: Mixture,
     /// The hull's outlines, `[h, w]`.
     outlines: Vec<Vec<bool>>,
-    /// What the other views show of each, as it is wanted for small and for large pictures; empty before masks are mended.
+    /// What the other views show of each, as it is wanted for small and for large pictures; empty before masks are refined.
     shown: Vec<[Shown; 2]>,
 }
 
@@ -416,7 +416,7 @@ impl Stage {
                 let mut biased = odds.clone();
                 for (k, o) in biased.iter_mut().enumerate() {
                     *o += match shown {
-                        Some(shown) => shown.odds(k) - if outline[k] { 0.0 } else { OUTSIDE_MENDING },
+                        Some(shown) => shown.odds(k) - if outline[k] { 0.0 } else { OUTSIDE_HULL },
                         None if outline[k] => INSIDE,
                         None => -OUTSIDE,
                     };

@@ -12,7 +12,7 @@ const SMOOTHNESS: f32 = 40.0;
 /// No pixel's log odds count for more.
 const MOST: f32 = 6.0;
 
-/// Most that is believed of the table: something else may lie there. Less while masks are mended, where others have a say.
+/// Most that is believed of the table: something else may lie there. Less while masks are refined, where others have a say.
 const TRUST: f32 = 0.99;
 
 const TRUST_MENDING: f32 = 0.5;

@@ -134,7 +134,7 @@ pub struct BuildOverrides {
     /// Views per object.
     pub views: Option<usize>,
     /// Optimization steps on each slice.
-    pub polish: Option<usize>,
+    pub slice_iterations: Option<usize>,
     /// Initial fits of a few views per object.
     pub input_fits: Option<usize>,
 }
@@ -144,7 +144,7 @@ impl MakingConfig {
     pub fn build_config(&self, seed: u64, depths: &[u32]) -> BuildConfig {
         let mut object = self.object.clone();
         object.views = self.build.views.unwrap_or(object.views);
-        object.polish = self.build.polish.unwrap_or(object.polish);
+        object.slice_iterations = self.build.slice_iterations.unwrap_or(object.slice_iterations);
         object.input_fits = self.build.input_fits.unwrap_or(object.input_fits);
         BuildConfig {
             seed,

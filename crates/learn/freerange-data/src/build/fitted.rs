@@ -33,11 +33,11 @@ pub(crate) fn fitted_gaussians(
 
 /// `slice` after `steps` gradient steps, each towards one of the `views`; its rows stay what and where they are in the
 /// order of the tree. Opacities stay within [`OPACITY_RANGE`].
-pub(crate) fn polished(slice: Gaussians, views: &[View], steps: usize, seed: u64) -> Result<Gaussians, BuildError> {
+pub(crate) fn optimized(slice: Gaussians, views: &[View], steps: usize, seed: u64) -> Result<Gaussians, BuildError> {
     adapted(slice, views, steps, POLISH_RATES, seed)
 }
 
-/// As [`polished`], at these rates.
+/// As [`optimized`], at these rates.
 pub(crate) fn adapted(
     slice: Gaussians,
     views: &[View],
@@ -69,7 +69,7 @@ pub(crate) fn adapted(
     Ok(slice)
 }
 
-/// Rates of [`polished`], at the start.
+/// Rates of [`optimized`], at the start.
 const POLISH_RATES: Rates = Rates { mean: 3e-3, scale: 1e-2, rotation: 1e-3, opacity: 0.05, color: 2.5e-3 };
 
 #[cfg(test)]
@@ -81,7 +81,7 @@ mod tests {
     use freerange_optim::psnr_over_white;
 
     #[test]
-    fn polished_slices_keep_their_rows_and_show_more() {
+    fn optimized_slices_keep_their_rows_and_show_more() {
         let mut config = tiny_config();
         config.views = 12;
         config.cameras.resolution = 64;
@@ -91,9 +91,9 @@ mod tests {
         let leaves = fitted_gaussians(&mut photographed, &config).unwrap();
         assert_eq!(leaves.len(), 512);
         let slice = LodTree::build(&leaves, config.alignment).unwrap().slice(6).unwrap();
-        assert_eq!(polished(slice.clone(), &photographed.views, 0, 1).unwrap(), slice);
-        let better = polished(slice.clone(), &photographed.views, 80, 1).unwrap();
-        assert_eq!(better, polished(slice.clone(), &photographed.views, 80, 1).unwrap());
+        assert_eq!(optimized(slice.clone(), &photographed.views, 0, 1).unwrap(), slice);
+        let better = optimized(slice.clone(), &photographed.views, 80, 1).unwrap();
+        assert_eq!(better, optimized(slice.clone(), &photographed.views, 80, 1).unwrap());
         let [before, after] = [&slice, &better].map(|c| psnr_over_white(c, &photographed.held_out).unwrap());
         assert!(after > before + 0.5, "{before} dB, then {after} dB");
         for i in 0..slice.len() {

@@ -3,7 +3,7 @@
 use std::ops::ControlFlow;
 
 use crate::InputFit;
-use freerange_optim::{Rates, quick_fit, tree_slice};
+use freerange_optim::{Rates, initial_fit, tree_slice};
 use freerange_scene::camera::{SelectionConfig, View, select_views};
 use glam::DVec3;
 use rand::{Rng, SeedableRng, seq::index};
@@ -33,8 +33,8 @@ const SETS: [(usize, Spread); 6] = [
     (5, Spread::Random),
 ];
 
-/// Rates of the steps that mend a fit, at the start. Twice those of polishing: there is farther to go.
-const MEND_RATES: Rates = Rates { mean: 6e-3, scale: 2e-2, rotation: 2e-3, opacity: 0.1, color: 5e-3 };
+/// Rates of the steps that make the target of a fit, at the start. Twice those of optimizing slices: there is farther to go.
+const TARGET_RATES: Rates = Rates { mean: 6e-3, scale: 2e-2, rotation: 2e-3, opacity: 0.1, color: 5e-3 };
 
 /// Views that an object with fits has at least: some cluster of four then holds four.
 pub(crate) const MIN_VIEWS: usize = 13;
@@ -42,17 +42,17 @@ pub(crate) const MIN_VIEWS: usize = 13;
 /// The fits that `config` asks for. Pure.
 pub(crate) fn input_fits(views: &[View], config: &ObjectConfig, seed: u64) -> Result<Vec<InputFit>, BuildError> {
     let centers: Vec<DVec3> = views.iter().map(|v| v.camera.center()).collect();
-    let depth = config.quick_fit.gaussians.ilog2();
+    let depth = config.initial_fit.gaussians.ilog2();
     let one = |number: usize| {
         // A stream of its own: whether something is fitted must not change the rest of the object.
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         rng.set_stream(16 + number as u64);
         let chosen = draw_set(&centers, SETS[number % SETS.len()], &mut rng)?;
         let inputs: Vec<View> = chosen.iter().map(|&i| views[i].clone()).collect();
-        let cloud = quick_fit(&inputs, &config.quick_fit, rng.random(), |_| ControlFlow::Continue(()))?;
+        let cloud = initial_fit(&inputs, &config.initial_fit, rng.random(), |_| ControlFlow::Continue(()))?;
         let gaussians = tree_slice(&cloud, depth)?;
-        let mended = adapted(gaussians.clone(), views, config.mend, MEND_RATES, seed)?;
-        Ok(InputFit { views: chosen, gaussians, mended })
+        let target = adapted(gaussians.clone(), views, config.target_iterations, TARGET_RATES, seed)?;
+        Ok(InputFit { views: chosen, gaussians, target })
     };
     (0..config.input_fits).map(one).collect()
 }
@@ -73,7 +73,7 @@ mod tests {
     use crate::build::generate_object;
     use crate::build::tests::tiny_config;
     use freerange_gaussians::Gaussians;
-    use freerange_optim::QuickFitConfig;
+    use freerange_optim::InitialFitConfig;
     use freerange_optim::psnr_over_white;
 
     #[test]
@@ -81,8 +81,8 @@ mod tests {
         let mut config = ObjectConfig { views: MIN_VIEWS, ..tiny_config() };
         let without = generate_object(5, &config, &[3]).unwrap();
         config.input_fits = 4;
-        config.mend = 100;
-        config.quick_fit = QuickFitConfig { iterations: 20, gaussians: 64, render_size: 32 };
+        config.target_iterations = 100;
+        config.initial_fit = InitialFitConfig { iterations: 20, gaussians: 64, render_size: 32 };
         let with = generate_object(5, &config, &[3]).unwrap();
         assert_eq!((&with.slices, &without.slices), (&without.slices, &with.slices));
         assert_eq!(with.input_fits.iter().map(|f| f.views.len()).collect::<Vec<_>>(), [4, 4, 3, 6]);
@@ -97,8 +97,8 @@ mod tests {
             assert_eq!(fit.depth(), 6);
             // Mended, they are the same ones, and show all views better.
             let psnr = |cloud: &Gaussians| psnr_over_white(cloud, &with.views).unwrap();
-            assert!(psnr(&fit.mended) > psnr(&fit.gaussians) + 1.0);
-            let moved = |i: usize| fit.gaussians.mean(i).distance(fit.mended.mean(i));
+            assert!(psnr(&fit.target) > psnr(&fit.gaussians) + 1.0);
+            let moved = |i: usize| fit.gaussians.mean(i).distance(fit.target.mean(i));
             assert!((0..64).map(moved).sum::<f64>() / 64.0 < 0.1);
         }
         // One side: closer together than around.

@@ -26,8 +26,8 @@ pub struct Item {
     pub file: Option<PathBuf>,
     /// Where it comes from, in words for people; goes into the object's metadata.
     pub source: String,
-    /// Licence, as an SPDX identifier.
-    pub licence: String,
+    /// License, as an SPDX identifier.
+    pub license: String,
     /// The part of the data that it belongs to; `None`: decided by its id.
     pub split: Option<Split>,
     /// Seed of all that is drawn for it; `None`: follows from its id and the seed of the configuration.
@@ -53,7 +53,7 @@ struct Line {
     path: PathBuf,
     id: Option<String>,
     source: Option<String>,
-    licence: Option<String>,
+    license: Option<String>,
     split: Option<Split>,
 }
 
@@ -68,7 +68,7 @@ impl Items {
     ///
     /// # Errors
     /// [`DataError::Io`]; [`DataError::File`] where there is none.
-    pub fn find(path: &Path, source: &str, licence: &str) -> Result<Self, DataError> {
+    pub fn find(path: &Path, source: &str, license: &str) -> Result<Self, DataError> {
         let mut files = Vec::new();
         if path.is_dir() {
             for entry in walkdir::WalkDir::new(path).sort_by_file_name() {
@@ -93,18 +93,18 @@ impl Items {
         let items = files.into_iter().map(|file| {
             let relative = file.strip_prefix(root).unwrap_or(&file).to_string_lossy().replace('\\', "/");
             let id = ids.name(&relative);
-            let (source, licence) = (format!("{source}{relative}"), licence.to_owned());
-            Item { id, file: Some(file), source, licence, split: None, seed: None }
+            let (source, license) = (format!("{source}{relative}"), license.to_owned());
+            Item { id, file: Some(file), source, license, split: None, seed: None }
         });
         Ok(Self { kind: Kind::Files(items.collect()) })
     }
 
     /// A list of meshes as JSON lines: `{"path": "chair.glb"}`, relative to the list's folder; further fields are `id`,
-    /// `source`, `licence` (SPDX), `split` (`train`, `validation` or `test`).
+    /// `source`, `license` (SPDX), `split` (`train`, `validation` or `test`).
     ///
     /// # Errors
     /// [`DataError::Io`]; [`DataError::File`] with the line that is wrong, or where an id occurs twice.
-    pub fn list(path: &Path, source: &str, licence: &str) -> Result<Self, DataError> {
+    pub fn list(path: &Path, source: &str, license: &str) -> Result<Self, DataError> {
         let problem = |problem: String| DataError::File { path: path.into(), problem };
         let mut text = String::new();
         let file = std::fs::File::open(path).map_err(IoError::at(path))?;
@@ -133,7 +133,7 @@ impl Items {
                 id,
                 file: Some(root.join(&line.path)),
                 source: line.source.unwrap_or_else(|| format!("{source}{relative}")),
-                licence: line.licence.unwrap_or_else(|| licence.to_owned()),
+                license: line.license.unwrap_or_else(|| license.to_owned()),
                 split: line.split,
                 seed: None,
             });
@@ -167,7 +167,7 @@ impl Items {
                     id: generated_id(seed),
                     file: None,
                     source: "generated".into(),
-                    licence: "CC0-1.0".into(),
+                    license: "CC0-1.0".into(),
                     split: None,
                     seed: Some(seed),
                 }
@@ -197,7 +197,7 @@ impl Items {
                 let mut hash = Sha256::new();
                 for item in items {
                     // Paths are not part of it: the same files may lie elsewhere on another machine.
-                    for field in [&item.id, &item.source, &item.licence, &format!("{:?}", item.split)] {
+                    for field in [&item.id, &item.source, &item.license, &format!("{:?}", item.split)] {
                         hash.update((field.len() as u64).to_le_bytes());
                         hash.update(field);
                     }
@@ -259,7 +259,7 @@ mod tests {
         let all: Vec<Item> = (0..items.len()).map(|i| items.get(i).unwrap()).collect();
         assert_eq!(all.len(), 4);
         assert_eq!(all[0].id, "b-c-mug");
-        assert_eq!((all[0].source.as_str(), all[0].licence.as_str()), ("shop: b/c/mug.GLB", "CC-BY-4.0"));
+        assert_eq!((all[0].source.as_str(), all[0].license.as_str()), ("shop: b/c/mug.GLB", "CC-BY-4.0"));
         assert!(all.iter().all(|i| crate::layout::is_key(&i.id)), "{all:?}");
         assert_eq!(all.iter().map(|i| &i.id).collect::<HashSet<_>>().len(), 4);
         assert_eq!(Items::find(root, "shop: ", "CC-BY-4.0").unwrap(), items);
@@ -277,14 +277,14 @@ mod tests {
         let path = folder.path().join("list.jsonl");
         let write = |text: &str| std::fs::write(&path, text).unwrap();
         write(
-            "{\"path\": \"m/a.glb\", \"licence\": \"MIT\", \"split\": \"test\"}\n\n{\"path\":\"/b.ply\",\"id\":\"bee\"}\n",
+            "{\"path\": \"m/a.glb\", \"license\": \"MIT\", \"split\": \"test\"}\n\n{\"path\":\"/b.ply\",\"id\":\"bee\"}\n",
         );
         let items = Items::list(&path, "", "unknown").unwrap();
         let (a, b) = (items.get(0).unwrap(), items.get(1).unwrap());
-        assert_eq!((a.id.as_str(), a.licence.as_str(), a.split), ("m-a", "MIT", Some(Split::Test)));
+        assert_eq!((a.id.as_str(), a.license.as_str(), a.split), ("m-a", "MIT", Some(Split::Test)));
         assert_eq!(a.file.unwrap(), folder.path().join("m/a.glb"));
         assert_eq!(Ids::default().name("/a/b c.ply"), "a-b-c");
-        assert_eq!((b.id.as_str(), b.licence.as_str(), b.file.unwrap()), ("bee", "unknown", "/b.ply".into()));
+        assert_eq!((b.id.as_str(), b.license.as_str(), b.file.unwrap()), ("bee", "unknown", "/b.ply".into()));
         for (text, named) in [
             ("", "found none"),
             ("{\"path\": \"a.glb\"}\n{}", "line 2"),
@@ -300,11 +300,11 @@ mod tests {
 
     #[test]
     fn the_description_tells_lists_apart_and_ignores_paths() {
-        let item = |id: &str, licence: &str| Item {
+        let item = |id: &str, license: &str| Item {
             id: id.into(),
             file: Some("x".into()),
             source: String::new(),
-            licence: licence.into(),
+            license: license.into(),
             split: None,
             seed: None,
         };

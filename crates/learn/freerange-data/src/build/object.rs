@@ -9,7 +9,7 @@ use freerange_assets::mesh::Mesh;
 use freerange_gaussians::{Gaussians, LodTree};
 use freerange_optim::psnr_over_white;
 
-use crate::build::fitted::{fitted_gaussians, polished};
+use crate::build::fitted::{fitted_gaussians, optimized};
 use crate::build::input_fit::input_fits;
 use crate::build::photographed::{Photographed, Seconds, add_elapsed};
 use crate::build::{BuildError, GaussianSource, ObjectConfig, surface_gaussians};
@@ -76,7 +76,8 @@ pub(crate) fn make(
 
     let start = Instant::now();
     let tree = LodTree::build_to_depth(&leaves, depths.iter().copied().max().unwrap_or(0), config.alignment)?;
-    let slice = |&depth: &u32| Ok((depth, polished(tree.slice(depth)?, &photographed.views, config.polish, seed)?));
+    let slice =
+        |&depth: &u32| Ok((depth, optimized(tree.slice(depth)?, &photographed.views, config.slice_iterations, seed)?));
     let slices = depths.iter().map(slice).collect::<Result<BTreeMap<_, _>, BuildError>>()?;
     add_elapsed(&mut seconds.tree, start);
 

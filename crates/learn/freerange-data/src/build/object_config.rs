@@ -3,7 +3,7 @@
 use freerange_assets::generate::GeneratorConfig;
 use freerange_assets::render::{CameraConfig, LightingConfig};
 use freerange_gaussians::Alignment;
-use freerange_optim::{FitConfig, QuickFitConfig};
+use freerange_optim::{FitConfig, InitialFitConfig};
 
 use crate::build::SurfaceConfig;
 
@@ -29,13 +29,13 @@ pub struct ObjectConfig {
     /// Settings of `fit`. Its seed is replaced by one drawn for the object.
     pub fit: FitConfig,
     /// Optimization steps on each slice of the tree. 0: the tree's own slices.
-    pub polish: usize,
+    pub slice_iterations: usize,
     /// Initial fits of a few views, each of another set of views: see [`InputFit`](crate::InputFit).
     pub input_fits: usize,
     /// Settings of these initial fits.
-    pub quick_fit: QuickFitConfig,
+    pub initial_fit: InitialFitConfig,
     /// Optimization steps on all views that make the target of each initial fit.
-    pub mend: usize,
+    pub target_iterations: usize,
     /// How the axes of the Gaussians in the tree are labeled.
     pub alignment: Alignment,
     /// Rendered views per object.
@@ -56,10 +56,10 @@ impl Default for ObjectConfig {
             gaussians: GaussianSource::Surface,
             surface: SurfaceConfig::default(),
             fit: FitConfig::default(),
-            polish: 0,
+            slice_iterations: 0,
             input_fits: 0,
-            quick_fit: QuickFitConfig::default(),
-            mend: 250,
+            initial_fit: InitialFitConfig::default(),
+            target_iterations: 250,
             alignment: Alignment::Identity,
             views: 40,
             samples_per_axis: 2,

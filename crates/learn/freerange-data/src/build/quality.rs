@@ -6,7 +6,7 @@ use freerange_gaussians::{Gaussians, LodTree};
 use freerange_optim::{FitConfig, psnr_over_white};
 use freerange_util::check;
 
-use crate::build::fitted::{fitted_gaussians, polished};
+use crate::build::fitted::{fitted_gaussians, optimized};
 use crate::build::item_object::{mesh_of, seed_of};
 use crate::build::items::Item;
 use crate::build::photographed::{Photographed, Seconds, add_elapsed};
@@ -41,7 +41,7 @@ pub struct CountQuality {
     /// The tree's slice of the full fit.
     pub slice: f64,
     /// That slice after some gradient steps; `None` where none were asked for.
-    pub polished: Option<f64>,
+    pub optimized: Option<f64>,
     /// The slice of a tree over points on the surface, as many as the full fit has Gaussians.
     pub surface: f64,
 }
@@ -80,10 +80,10 @@ pub fn measure_quality(item: &Item, config: &BuildConfig, counts: &[usize]) -> R
         let fit = FitConfig { cap_max: gaussians, initial: object.fit.initial.min(gaussians), ..object.fit.clone() };
         let (_, fit, fit_seconds) = timed(&mut photographed, fit)?;
         let slice = tree.slice(gaussians.ilog2())?;
-        let polished = match object.polish {
+        let optimized = match object.slice_iterations {
             0 => None,
             steps => Some(psnr_over_white(
-                &polished(slice.clone(), &photographed.views, steps, seed)?,
+                &optimized(slice.clone(), &photographed.views, steps, seed)?,
                 &photographed.held_out,
             )?),
         };
@@ -92,7 +92,7 @@ pub fn measure_quality(item: &Item, config: &BuildConfig, counts: &[usize]) -> R
             fit,
             fit_seconds,
             slice: psnr_over_white(&slice, &photographed.held_out)?,
-            polished,
+            optimized,
             surface: psnr_over_white(&surface.slice(gaussians.ilog2())?, &photographed.held_out)?,
         })
     });
@@ -114,7 +114,7 @@ mod tests {
         config.object.fit.iterations = 100;
         config.object.fit.initial = 1024;
         config.object.fit.cap_max = 1024;
-        config.object.polish = 20;
+        config.object.slice_iterations = 20;
         let folder = tempfile::tempdir().unwrap();
         write_ball(&folder.path().join("ball.ply"));
         let item = Items::find(folder.path(), "", "CC0-1.0").unwrap().get(0).unwrap();
@@ -122,7 +122,7 @@ mod tests {
         assert_eq!((q.id.as_str(), q.gaussians, q.by_count.len()), ("ball", 1024, 2));
         let [few, many] = [&q.by_count[0], &q.by_count[1]];
         assert!(many.fit > few.fit + 1.0 && many.slice > few.slice + 1.0 && many.surface > few.surface + 1.0, "{q:?}");
-        assert!(q.full > few.fit + 1.0 && few.polished.unwrap() > few.slice, "{q:?}");
+        assert!(q.full > few.fit + 1.0 && few.optimized.unwrap() > few.slice, "{q:?}");
         assert!(q.full_seconds > 0.0 && many.fit_seconds > 0.0 && q.triangles > 0);
         for bad in [&[3usize][..], &[2048]] {
             assert!(measure_quality(&item, &config, bad).unwrap_err().to_string().contains("powers of two"));

@@ -22,9 +22,9 @@ impl ObjectConfig {
         if self.input_fits > 0 {
             let expected = format!("at least {MIN_VIEWS} with object.input_fits");
             check(self.views >= MIN_VIEWS, "object.views", &expected, self.views)?;
-            let count = self.quick_fit.gaussians;
-            check(count.is_power_of_two(), "object.quick_fit.gaussians", "a power of two", count)?;
-            self.quick_fit.check()?;
+            let count = self.initial_fit.gaussians;
+            check(count.is_power_of_two(), "object.initial_fit.gaussians", "a power of two", count)?;
+            self.initial_fit.check()?;
         }
         let s = &self.surface;
         let points = 1..=1usize << MAX_DEPTH;

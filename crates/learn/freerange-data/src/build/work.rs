@@ -261,7 +261,7 @@ where
         let metadata = Metadata {
             id: item.id.clone(),
             source: item.source.clone(),
-            licence: item.licence.clone(),
+            license: item.license.clone(),
             file_sha256: facts.sha256,
             notes: facts.notes,
             seed,
@@ -310,7 +310,7 @@ where
         let mut file = self.store.create(&name)?;
         let mut offset = 0;
         for index in self.plan.shard_objects(shard) {
-            let Item { id, licence, .. } = self.item(index)?;
+            let Item { id, license, .. } = self.item(index)?;
             match self.outcome(&folder, index)?.ok_or_else(|| lost(format!("{folder}/{}", outcome_name(index))))? {
                 Outcome::Failed { reason } => record.failures.push(Failure { index, id, reason }),
                 Outcome::Built { split, psnr, flagged, statistics } => {
@@ -318,7 +318,7 @@ where
                     let content = self.store.read(&part, MAX_PART)?.ok_or_else(|| lost(part))?;
                     file.write_all(&content).map_err(IoError::at(&self.store.path(&name)))?;
                     let bytes = content.len() as u64;
-                    let object = ObjectRecord { index, id, offset, bytes, licence, split, psnr, flagged };
+                    let object = ObjectRecord { index, id, offset, bytes, license, split, psnr, flagged };
                     offset += bytes;
                     if object.is_for_training() {
                         let all = record.statistics.iter_mut();

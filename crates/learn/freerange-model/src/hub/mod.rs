@@ -7,6 +7,8 @@
 //! In the cache: `hub/OWNER/NAME/refs/REVISION` holds a commit, `hub/OWNER/NAME/COMMIT/` the files and `pins.json`.
 
 #[cfg(feature = "download")]
+mod client;
+#[cfg(feature = "download")]
 mod download;
 mod error;
 
@@ -22,6 +24,8 @@ use std::{
 use freerange_util::{IoError, sha256_of};
 use serde::{Deserialize, Serialize};
 
+#[cfg(feature = "download")]
+pub use client::{Client, Entry};
 pub use error::HubError;
 
 /// A repository of a model on the hub, at a revision.

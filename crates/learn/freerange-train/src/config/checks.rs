@@ -95,16 +95,16 @@ impl<M: Making> TrainConfig<M> {
         check(made, "data.object.input_fits", "at least 1 with loss.refinement", "0".into())
     }
 
-    /// That lanes divide what they share, and that there is anything.
+    /// That virtual ranks divide what they share, and that there is anything.
     fn check_data(&self) -> Result<(), Invalid> {
-        let lanes = self.data.lanes;
-        check((1..=4096).contains(&lanes), "data.lanes", "1 to 4096", lanes.to_string())?;
-        let of_lanes = format!("a multiple of data.lanes, {lanes}");
+        let virtual_ranks = self.data.virtual_ranks;
+        check((1..=4096).contains(&virtual_ranks), "data.virtual_ranks", "1 to 4096", virtual_ranks.to_string())?;
+        let of_ranks = format!("a multiple of data.virtual_ranks, {virtual_ranks}");
         for (field, value) in [("data.window", self.data.window), ("data.fresh", self.data.fresh)] {
-            check(value.is_multiple_of(lanes), field, &of_lanes, value.to_string())?;
+            check(value.is_multiple_of(virtual_ranks), field, &of_ranks, value.to_string())?;
         }
         for s in &self.stages {
-            check(s.batch.is_multiple_of(lanes), "stage.batch", &of_lanes, s.batch.to_string())?;
+            check(s.batch.is_multiple_of(virtual_ranks), "stage.batch", &of_ranks, s.batch.to_string())?;
         }
         check(self.data.window > 0, "data.window", "at least 1", self.data.window.to_string())?;
         check(self.data.workers > 0, "data.workers", "at least 1", self.data.workers.to_string())?;

@@ -19,9 +19,9 @@ pub struct DataConfig<M = ()> {
     pub fresh: usize,
     /// Threads that make or read objects beside training.
     pub workers: usize,
-    /// Virtual ranks. Object i belongs to virtual rank i mod `lanes`; each has its part of window, fresh objects and batch.
+    /// Virtual ranks. Object i belongs to virtual rank i mod `virtual_ranks`; each has its part of window, fresh objects and batch.
     /// Any number of processes that divides it trains the same, and each reads only its own objects.
-    pub lanes: usize,
+    pub virtual_ranks: usize,
     /// Objects over which the normalization statistics are measured before training.
     pub statistics_objects: usize,
     /// How objects are made. Its fields are beside the others.
@@ -37,7 +37,7 @@ impl<M: Default> Default for DataConfig<M> {
             window: 64,
             fresh: 2,
             workers: 1,
-            lanes: 1,
+            virtual_ranks: 1,
             statistics_objects: 256,
             making: M::default(),
         }

@@ -47,7 +47,7 @@ pub struct LossConfig {
 
 /// Training of a [`Refiner`](freerange_diffusion::sample::Refiner): batches without noise, at time 0, in which the network is fed an initial
 /// fit as an estimate. They have the input views of their fits, and lead to what these should have been:
-/// [`InputFit::mended`](freerange_data::InputFit).
+/// [`InputFit::target`](freerange_data::InputFit).
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RefinementLoss {

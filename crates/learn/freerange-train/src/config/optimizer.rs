@@ -3,7 +3,7 @@
 use freerange_model::Compute;
 use freerange_util::{Invalid, check};
 
-use crate::ranks::Wire;
+use crate::ranks::AllReduceDtype;
 
 /// AdamW and its schedule.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
@@ -30,7 +30,7 @@ pub struct OptimizerConfig {
     /// Precision of the blocks: `f32`, `bf16`, or `auto` for the faster on this device. Weights and sums stay in 32 bits.
     pub compute: Compute,
     /// All-reduce dtype of gradients: `f32`, or `bf16` for half of the bytes.
-    pub wire: Wire,
+    pub all_reduce_dtype: AllReduceDtype,
     /// Gradient checkpointing: keep only the input of each block and compute it again for the gradient. A fraction of the memory
     /// for a third more work.
     pub recompute: bool,
@@ -49,7 +49,7 @@ impl Default for OptimizerConfig {
             clip: 1.0,
             ema: 0.9999,
             compute: Compute::F32,
-            wire: Wire::F32,
+            all_reduce_dtype: AllReduceDtype::F32,
             recompute: false,
         }
     }

@@ -29,8 +29,8 @@ impl Stage {
         self.micro_batch.unwrap_or(self.batch)
     }
 
-    /// How many times a step computes for each of `lanes` lanes, which divide the batch.
-    pub fn parts_per_lane(&self, lanes: usize) -> usize {
-        (self.batch / lanes).div_ceil(self.at_a_time())
+    /// How many times a step computes for each of `virtual_ranks` virtual ranks, which divide the batch.
+    pub fn parts_per_virtual_rank(&self, virtual_ranks: usize) -> usize {
+        (self.batch / virtual_ranks).div_ceil(self.at_a_time())
     }
 }

@@ -2,7 +2,7 @@
 
 use burn::tensor::{Device, Tensor};
 
-use super::{Ranks, Wire};
+use super::{AllReduceDtype, Ranks};
 use crate::{TrainError, flat::Flat};
 
 /// What one rank brings.
@@ -11,9 +11,9 @@ pub(crate) struct Own {
     pub found: Option<(Flat, Tensor<1>)>,
     /// From the beginning of the step until now.
     pub seconds: f64,
-    /// Numbers of its lanes, and of the first object of each one's window.
+    /// Numbers of its virtual ranks, and of the first object of each one's window.
     pub positions: Vec<(usize, u64)>,
-    /// Objects of its lanes that could not be read: before those windows, and in all.
+    /// Objects of its virtual ranks that could not be read: before those windows, and in all.
     pub broken: [u64; 2],
     /// Whether it is out of time.
     pub stop: bool,
@@ -26,7 +26,7 @@ pub(crate) struct Agreed {
     pub present: Vec<bool>,
     /// [`Own::seconds`], by rank.
     pub seconds: Vec<f32>,
-    /// [`Own::positions`], by lane.
+    /// [`Own::positions`], by virtual rank.
     pub positions: Vec<u64>,
     /// Sums of [`Own::broken`].
     pub broken: [u64; 2],
@@ -45,8 +45,8 @@ pub(crate) struct Layout {
     pub figures: usize,
     /// Number of ranks.
     pub world: usize,
-    /// Number of lanes of all ranks.
-    pub lanes: usize,
+    /// Number of virtual ranks of all ranks.
+    pub virtual_ranks: usize,
 }
 
 /// Whole numbers are told in pieces of so many bits, which 32-bit numbers hold exactly.
@@ -60,22 +60,22 @@ impl Layout {
         &self,
         ranks: &dyn Ranks,
         own: Own,
-        wire: Wire,
+        dtype: AllReduceDtype,
         device: &Device,
     ) -> Result<(Flat, Tensor<1>), TrainError> {
         let mut parts = self.parts(ranks.rank(), own, device);
         let mut sizes: Vec<usize> = parts.iter().map(|part| part.dims()[0]).collect();
-        let (gradients, tail) = match wire {
-            Wire::F32 => {
-                let mut parts = ranks.sum(Tensor::cat(parts, 0), wire)?.split_with_sizes(sizes, 0);
+        let (gradients, tail) = match dtype {
+            AllReduceDtype::F32 => {
+                let mut parts = ranks.sum(Tensor::cat(parts, 0), dtype)?.split_with_sizes(sizes, 0);
                 let tail = parts.pop().expect("the last one");
                 (parts, tail)
             }
             // Gradients may be rounded, the rest may not.
-            Wire::Bf16 => {
-                let tail = ranks.sum(parts.pop().expect("the last one"), Wire::F32)?;
+            AllReduceDtype::Bf16 => {
+                let tail = ranks.sum(parts.pop().expect("the last one"), AllReduceDtype::F32)?;
                 sizes.pop();
-                (ranks.sum(Tensor::cat(parts, 0), wire)?.split_with_sizes(sizes, 0), tail)
+                (ranks.sum(Tensor::cat(parts, 0), dtype)?.split_with_sizes(sizes, 0), tail)
             }
         };
         Ok((Flat(gradients.into_iter().map(Some).collect()), tail))
@@ -89,15 +89,15 @@ impl Layout {
             Some((gradients, figures)) => (gradients.0, figures),
             None => (vec![None; self.parameters.len()], zeros(self.figures)),
         };
-        let mut told = vec![0.0; self.parameters.len() + self.world + PIECES * self.lanes + 3 + self.world];
+        let mut told = vec![0.0; self.parameters.len() + self.world + PIECES * self.virtual_ranks + 3 + self.world];
         let (present, rest) = told.split_at_mut(self.parameters.len());
         let (seconds, rest) = rest.split_at_mut(self.world);
-        let (positions, rest) = rest.split_at_mut(PIECES * self.lanes);
+        let (positions, rest) = rest.split_at_mut(PIECES * self.virtual_ranks);
         let (others, who) = rest.split_at_mut(3);
         present.iter_mut().zip(&gradients).for_each(|(x, g)| *x = f32::from(u8::from(g.is_some())));
         seconds[rank] = own.seconds as f32;
-        for (lane, position) in own.positions {
-            for (i, piece) in positions[PIECES * lane..][..PIECES].iter_mut().enumerate() {
+        for (virtual_rank, position) in own.positions {
+            for (i, piece) in positions[PIECES * virtual_rank..][..PIECES].iter_mut().enumerate() {
                 *piece = ((position >> (BITS * i as u32)) & ((1 << BITS) - 1)) as f32;
             }
         }
@@ -114,7 +114,7 @@ impl Layout {
     pub fn read(&self, told: &[f32]) -> Agreed {
         let (present, rest) = told.split_at(self.parameters.len());
         let (seconds, rest) = rest.split_at(self.world);
-        let (positions, rest) = rest.split_at(PIECES * self.lanes);
+        let (positions, rest) = rest.split_at(PIECES * self.virtual_ranks);
         let (others, failed) = rest.split_at(3);
         let number = |pieces: &[f32]| pieces.iter().rev().fold(0, |sum, &x| (sum << BITS) + x as u64);
         Agreed {
@@ -135,16 +135,16 @@ mod tests {
 
     #[test]
     fn everything_arrives() {
-        for wire in [Wire::F32, Wire::Bf16] {
-            check(wire);
+        for dtype in [AllReduceDtype::F32, AllReduceDtype::Bf16] {
+            check(dtype);
         }
     }
 
-    fn check(wire: Wire) {
+    fn check(dtype: AllReduceDtype) {
         let big = (1u64 << 59) + 12_345_678_901;
         let found = among(2, |ranks| {
             let device = Device::flex();
-            let layout = Layout { parameters: vec![2, 3, 1], figures: 2, world: 2, lanes: 4 };
+            let layout = Layout { parameters: vec![2, 3, 1], figures: 2, world: 2, virtual_ranks: 4 };
             let (rank, x) = (ranks.rank(), ranks.rank() as f32);
             let tensor = |numbers: &[f32]| Tensor::<1>::from_floats(numbers, &device);
             // The second parameter has a gradient on one rank only, the third on none.
@@ -157,12 +157,12 @@ mod tests {
                 broken: [1, 2 + rank as u64],
                 stop: rank == 1,
             };
-            let (gradients, tail) = layout.sum(&*ranks, own, wire, &device).unwrap();
+            let (gradients, tail) = layout.sum(&*ranks, own, dtype, &device).unwrap();
             let tail = tail.into_data().try_to_vec::<f32>().unwrap();
             let failing = Own { found: None, seconds: 0.0, positions: vec![], broken: [0; 2], stop: false };
             let fine = Some((Flat(vec![None, None, None]), tensor(&[0.0; 2])));
             let own = if rank == 1 { failing } else { Own { found: fine, ..failing } };
-            let failed = layout.sum(&*ranks, own, wire, &device).unwrap().1.into_data().try_to_vec::<f32>().unwrap();
+            let failed = layout.sum(&*ranks, own, dtype, &device).unwrap().1.into_data().try_to_vec::<f32>().unwrap();
             (gradients.values(), tail[..2].to_vec(), layout.read(&tail[2..]), layout.read(&failed[2..]))
         });
         for (gradients, figures, agreed, failed) in found {

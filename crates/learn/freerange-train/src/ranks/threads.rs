@@ -12,7 +12,7 @@ use burn::tensor::{Tensor, TensorData};
 
 use half::bf16;
 
-use super::{Ranks, Wire};
+use super::{AllReduceDtype, Ranks};
 use crate::TrainError;
 
 /// Longer than any sum of a test takes to come together; a rank that has panicked never comes.
@@ -41,9 +41,9 @@ impl Ranks for Threads {
         self.world
     }
 
-    fn sum(&self, flat: Tensor<1>, wire: Wire) -> Result<Tensor<1>, TrainError> {
+    fn sum(&self, flat: Tensor<1>, dtype: AllReduceDtype) -> Result<Tensor<1>, TrainError> {
         let device = flat.device();
-        let round = |x: f32| if wire == Wire::Bf16 { bf16::from_f32(x).to_f32() } else { x };
+        let round = |x: f32| if dtype == AllReduceDtype::Bf16 { bf16::from_f32(x).to_f32() } else { x };
         let mut own = flat.into_data().try_to_vec::<f32>().expect("f32");
         own.iter_mut().for_each(|x| *x = round(*x));
         let (table, changed) = &*self.table;

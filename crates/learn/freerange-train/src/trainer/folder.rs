@@ -63,7 +63,7 @@ fn check_same_run<M: Making>(config: &TrainConfig<M>, folder: &Path) -> Result<(
                 }
                 c.data.shards = c.data.shards.map(|place| local(&place, |path| path.canonicalize()));
                 c.optimizer.compute = Default::default();
-                c.optimizer.wire = Default::default();
+                c.optimizer.all_reduce_dtype = Default::default();
                 c.optimizer.schedule = Default::default();
                 // A rate that is brought down wants an average that follows it.
                 c.optimizer.ema = Default::default();

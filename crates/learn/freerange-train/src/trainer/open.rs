@@ -12,9 +12,9 @@ use super::{
     among::{Among, Initial},
     encoder::{load_encoder, require_same_encoder, require_same_model},
     folder::claim,
-    lanes::lanes,
     objects::{normalization, training_objects, validation_objects},
     state::{State, latest_state},
+    virtual_ranks::virtual_ranks,
 };
 use crate::{
     TrainError,
@@ -105,7 +105,7 @@ impl Trainer {
             .positions(&config.data)
             .map_err(|problem| TrainError::State { path: folder.join("progress.json"), problem })?;
         progress(&format!("filling the window with {} objects", config.data.window));
-        let lanes = agree(ranks, lanes(&config.data, &positions, share, &source))?;
+        let virtual_ranks = agree(ranks, virtual_ranks(&config.data, &positions, share, &source))?;
         state.set_positions(positions);
         Ok(Self {
             photometric: Photometric::new(&state.normalization, &plain),
@@ -119,7 +119,7 @@ impl Trainer {
             broken: state.broken,
             progress: state,
             ranks: among.ranks,
-            lanes,
+            virtual_ranks,
             stop_when: Box::new(|| false),
             interrupt_when: Box::new(|| false),
             ahead: None,
@@ -150,10 +150,10 @@ impl Prepared {
         progress: &mut impl FnMut(&str),
     ) -> Result<Self, TrainError> {
         config.validate()?;
-        let lanes = config.data.lanes;
-        if !lanes.is_multiple_of(world) {
+        let virtual_ranks = config.data.virtual_ranks;
+        if !virtual_ranks.is_multiple_of(world) {
             let expected = format!("a multiple of the number of ranks, {world}");
-            return Err(Invalid::new("data.lanes", expected, lanes).into());
+            return Err(Invalid::new("data.virtual_ranks", expected, virtual_ranks).into());
         }
         // Where nothing is differentiated, and features are those of sampling to the bit.
         let encoder = load_encoder(&config.model.encoder, encoder, device, progress)?;

@@ -26,10 +26,10 @@ pub(super) struct Progress {
     #[serde(default)]
     pub(super) inherited: bool,
     pub(super) normalization: Normalization,
-    /// Number of the first object of the window that the next batch is drawn from; none where there are several lanes.
+    /// Number of the first object of the window that the next batch is drawn from; none where there are several virtual ranks.
     #[serde(default)]
     pub(super) first_object: Option<u64>,
-    /// That number in each of several lanes.
+    /// That number in each of several virtual ranks.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub(super) first_objects: Vec<u64>,
     /// Objects before it that could not be read.
@@ -50,15 +50,15 @@ pub(super) struct Progress {
 }
 
 impl Progress {
-    /// Of each lane, the number of the first object of its window.
+    /// Of each virtual rank, the number of the first object of its window.
     pub(super) fn positions(&self, data: &DataConfig) -> Result<Vec<u64>, String> {
-        match (data.lanes, self.first_objects.len()) {
+        match (data.virtual_ranks, self.first_objects.len()) {
             (1, 0) => Ok(vec![self.first_object.unwrap_or(self.step * data.fresh as u64)]),
-            (lanes, 0) if self.step == 0 => Ok((0..lanes as u64).collect()),
-            (lanes, found) if lanes == found => Ok(self.first_objects.clone()),
-            (lanes, found) => {
-                Err(format!("first_objects: expected {lanes}, one for each of data.lanes, found {found}"))
-            }
+            (virtual_ranks, 0) if self.step == 0 => Ok((0..virtual_ranks as u64).collect()),
+            (virtual_ranks, found) if virtual_ranks == found => Ok(self.first_objects.clone()),
+            (virtual_ranks, found) => Err(format!(
+                "first_objects: expected {virtual_ranks}, one for each of data.virtual_ranks, found {found}"
+            )),
         }
     }
 

@@ -112,7 +112,7 @@ impl Trainer {
     fn compute(&mut self, index: u64) -> Result<Computed, TrainError> {
         let stage = self.config.stage(index).clone();
         let parts = self.own_parts(&stage);
-        let all_parts = stage.parts_per_lane(self.config.data.lanes) * self.config.data.lanes;
+        let all_parts = stage.parts_per_virtual_rank(self.config.data.virtual_ranks) * self.config.data.virtual_ranks;
         let mut data_seconds = 0.0;
         let rms = Tensor::<1>::from_floats(self.gradient_rms(), &self.device).reshape([1, 1, channel::COUNT]);
         let mut sums: Option<(Flat, Tensor<1>)> = None;
@@ -149,7 +149,11 @@ impl Trainer {
             match parts.get(i + 1) {
                 Some(&next) => self.ahead = Some(self.draw(index, next)),
                 None => {
-                    positions = self.lanes.iter().map(|lane| (lane.number, lane.first())).collect();
+                    positions = self
+                        .virtual_ranks
+                        .iter()
+                        .map(|virtual_rank| (virtual_rank.number, virtual_rank.first()))
+                        .collect();
                     if index + 1 < self.config.total_steps() {
                         let next = self.own_parts(self.config.stage(index + 1))[0];
                         self.ahead = Some(self.draw(index + 1, next));
@@ -185,7 +189,7 @@ impl Trainer {
             parameters: self.average.0.iter().map(|w| w.dims()[0]).collect(),
             figures: LOSSES + if self.model().dit().gradient_channels() { channel::COUNT } else { 0 },
             world: ranks.world(),
-            lanes: self.config.data.lanes,
+            virtual_ranks: self.config.data.virtual_ranks,
         };
         let computed = computed.and_then(|computed| {
             // Else a device would seem fast that has only been told what to do.
@@ -206,7 +210,7 @@ impl Trainer {
             seconds: begin.elapsed().as_secs_f64(),
         };
         let summing = Instant::now();
-        let (mut gradients, tail) = layout.sum(ranks, own, self.config.optimizer.wire, &self.device)?;
+        let (mut gradients, tail) = layout.sum(ranks, own, self.config.optimizer.all_reduce_dtype, &self.device)?;
         let mut figures = numbers(Tensor::cat(vec![gradients.norm(&self.device), tail], 0))?;
         let sum_seconds = summing.elapsed().as_secs_f64();
         let agreed = layout.read(&figures.split_off(1 + layout.figures));

@@ -430,10 +430,10 @@ fn with_shards(mut config: TrainConfig, place: &Path) -> TrainConfig {
     config
 }
 
-/// Four lanes, two stages with different batches, depths and parts, objects that come and go, validation.
-fn in_lanes() -> TrainConfig {
+/// Four virtual ranks, two stages with different batches, depths and parts, objects that come and go, validation.
+fn in_virtual_ranks() -> TrainConfig {
     let mut config = config();
-    config.data = DataConfig { lanes: 4, window: 12, fresh: 4, ..config.data };
+    config.data = DataConfig { virtual_ranks: 4, window: 12, fresh: 4, ..config.data };
     config.stages[0] = Stage { depth: 3, batch: 8, micro_batch: Some(1), steps: 5, ..config.stages[0].clone() };
     config.stages.push(Stage { depth: 4, batch: 4, micro_batch: None, steps: 25, ..config.stages[0].clone() });
     config.validation = crate::ValidationConfig { every: 4, objects: 3 };
@@ -454,7 +454,7 @@ type Told = (Vec<[f32; 5]>, Vec<Figures>, [String; 2], Vec<u64>);
 fn told(world: usize, config: &TrainConfig, folder: &Path, until: u64) -> Vec<Told> {
     among(world, |ranks| {
         let mut trainer = open_among(ranks.clone(), config, folder).unwrap();
-        assert_eq!(trainer.lanes.len(), config.data.lanes / world);
+        assert_eq!(trainer.virtual_ranks.len(), config.data.virtual_ranks / world);
         let (mut steps, mut figures) = (Vec::new(), Vec::new());
         while trainer.step_count() < until {
             let r = trainer.step().unwrap();
@@ -481,7 +481,7 @@ fn close(found: &[[f32; 5]], expected: &[[f32; 5]]) {
 #[test]
 fn any_number_of_ranks_trains_the_same() {
     let place = tempfile::tempdir().unwrap();
-    let mut config = in_lanes();
+    let mut config = in_virtual_ranks();
     config.data.making.shard.validation = 0.2;
     let config = with_shards(config, place.path());
     let alone = told(1, &config, &place.path().join("1"), 20).remove(0);
@@ -519,7 +519,7 @@ fn any_number_of_ranks_trains_the_same() {
 fn an_object_that_one_rank_cannot_read_is_left_out_on_all() {
     let place = tempfile::tempdir().unwrap();
     let path = |name: &str| place.path().join(name);
-    let mut config = in_lanes();
+    let mut config = in_virtual_ranks();
     config.validation.every = 0;
     let config = with_shards(config, place.path());
     let shards =
@@ -546,7 +546,7 @@ fn an_object_that_one_rank_cannot_read_is_left_out_on_all() {
         found.into_iter().next().unwrap()
     };
     let alone = run(1, "1", 6);
-    // Lane 1 is one object ahead of the others.
+    // VirtualRank 1 is one object ahead of the others.
     assert_eq!((alone.1, &alone.2[..]), (1, &[24, 29, 26, 27][..]));
     let two = run(2, "2", 6);
     close(&two.0, &alone.0);
@@ -562,7 +562,7 @@ fn an_object_that_one_rank_cannot_read_is_left_out_on_all() {
 #[test]
 fn where_one_rank_fails_all_stop_at_the_same_step_and_can_go_on() {
     let place = tempfile::tempdir().unwrap();
-    let config = in_lanes();
+    let config = in_virtual_ranks();
     let found = among(2, |ranks| {
         let mut trainer = open_among(ranks.clone(), &config, &place.path().join("run")).unwrap();
         (0..3).for_each(|_| drop(trainer.step().unwrap()));
@@ -585,7 +585,7 @@ fn ranks_that_cannot_train_together_are_refused() {
     let place = tempfile::tempdir().unwrap();
     let refused = |world: usize, change: fn(&mut TrainConfig)| {
         let found = among(world, |ranks| {
-            let mut config = in_lanes();
+            let mut config = in_virtual_ranks();
             if ranks.rank() + 1 == world {
                 change(&mut config);
             }
@@ -595,7 +595,7 @@ fn ranks_that_cannot_train_together_are_refused() {
         found
     };
     for text in refused(3, |_| ()) {
-        assert_eq!(text, "data.lanes: expected a multiple of the number of ranks, 3, found 4");
+        assert_eq!(text, "data.virtual_ranks: expected a multiple of the number of ranks, 3, found 4");
     }
     for text in refused(2, |config| config.loss.seen = false) {
         assert!(
@@ -610,7 +610,7 @@ fn ranks_that_cannot_train_together_are_refused() {
 #[test]
 fn all_ranks_stop_when_one_is_to_and_weights_that_came_apart_are_told() {
     let place = tempfile::tempdir().unwrap();
-    let config = in_lanes();
+    let config = in_virtual_ranks();
     among(2, |ranks| {
         let mut trainer = open_among(ranks.clone(), &config, &place.path().join("run")).unwrap();
         assert!(!trainer.step().unwrap().stop);
@@ -628,9 +628,9 @@ fn all_ranks_stop_when_one_is_to_and_weights_that_came_apart_are_told() {
 }
 
 #[test]
-fn lanes_divide_batch_and_window() {
+fn virtual_ranks_divide_batch_and_window() {
     let refused = |change: fn(&mut TrainConfig)| {
-        let mut config = in_lanes();
+        let mut config = in_virtual_ranks();
         change(&mut config);
         config.validate().unwrap_err().to_string()
     };
@@ -638,12 +638,12 @@ fn lanes_divide_batch_and_window() {
         refused(|c| c.data.window = 10),
         refused(|c| c.data.fresh = 2),
         refused(|c| c.stages[1].batch = 6),
-        refused(|c| c.data.lanes = 0),
+        refused(|c| c.data.virtual_ranks = 0),
     ];
-    assert_eq!(found[0], "data.window: expected a multiple of data.lanes, 4, found 10");
-    assert_eq!(found[1], "data.fresh: expected a multiple of data.lanes, 4, found 2");
-    assert_eq!(found[2], "stage.batch: expected a multiple of data.lanes, 4, found 6");
-    assert_eq!(found[3], "data.lanes: expected 1 to 4096, found 0");
+    assert_eq!(found[0], "data.window: expected a multiple of data.virtual_ranks, 4, found 10");
+    assert_eq!(found[1], "data.fresh: expected a multiple of data.virtual_ranks, 4, found 2");
+    assert_eq!(found[2], "stage.batch: expected a multiple of data.virtual_ranks, 4, found 6");
+    assert_eq!(found[3], "data.virtual_ranks: expected 1 to 4096, found 0");
 }
 
 /// A run whose model refines initial fits, on objects that have none.
@@ -773,7 +773,7 @@ fn a_step_in_parts_can_be_given_up() {
 #[test]
 fn all_ranks_give_a_measurement_up_where_one_is_asked_to_end() {
     let place = tempfile::tempdir().unwrap();
-    let mut config = in_lanes();
+    let mut config = in_virtual_ranks();
     config.validation.every = 1;
     among(2, |ranks| {
         let mut trainer = open_among(ranks.clone(), &config, &place.path().join("run")).unwrap();

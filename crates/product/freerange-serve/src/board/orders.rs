@@ -68,9 +68,9 @@ impl Board {
     }
 
     /// Gives a photo another mask.
-    pub fn mend(&self, id: &str, k: usize, png: &[u8]) -> Result<f64, Refusal> {
+    pub fn edit_mask(&self, id: &str, k: usize, png: &[u8]) -> Result<f64, Refusal> {
         // One at a time: pictures take memory, and files are replaced.
-        let _one = self.mending.lock().unwrap_or_else(PoisonError::into_inner);
+        let _one = self.editing.lock().unwrap_or_else(PoisonError::into_inner);
         let folder = {
             let table = self.table();
             let job = table.jobs.get(id).ok_or_else(no_such)?;
@@ -85,10 +85,10 @@ impl Board {
             }
             job.folder.clone()
         };
-        let covers = scene::mend(&folder, k, png)?;
+        let covers = scene::edit_mask(&folder, k, png)?;
         self.change(id, |job| {
             let view = &mut job.record.understood["views"][k];
-            (view["mended"], view["covers"]) = (true.into(), covers.into());
+            (view["edited"], view["covers"]) = (true.into(), covers.into());
             Ok(covers)
         })
     }

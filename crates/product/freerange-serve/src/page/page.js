@@ -2,7 +2,7 @@
 // The page of `freerange serve`. Text of users and of their files only ever becomes text nodes.
 /**
  * @typedef {{width: number, height: number, fx: number, fy: number, cx: number, cy: number, world_to_camera: number[]}} Camera
- * @typedef {{name: string, camera: Camera, shown: boolean, covers: number, agreement: number, cut_off: boolean, mended: boolean}} Photo
+ * @typedef {{name: string, camera: Camera, shown: boolean, covers: number, agreement: number, cut_off: boolean, edited: boolean}} Photo
  * @typedef {{center: number[], radius: number, up: number[], views: Photo[], notes: string[], warnings: string[], format: string, masks: string}} Understood
  * @typedef {{number: number, stage: string, parts: {sample: number, gaussians: number}[]}} Estimate
  * @typedef {{id: string, title: string, created: number, state: string, error: ?string, position: ?number, stage: ?string, sample: number, done: number,
@@ -412,11 +412,11 @@
    * @param {Understood} understood
    */
   const photos = (now, understood) => {
-    const key = JSON.stringify([now.id, now.may_go, understood.views.map((v) => [v.covers, v.mended])]), list = box("photos");
+    const key = JSON.stringify([now.id, now.may_go, understood.views.map((v) => [v.covers, v.edited])]), list = box("photos");
     if (list.dataset.key === key) return;
     list.dataset.key = key;
     list.replaceChildren(...understood.views.map((photo, k) => {
-      const about = `mask ${(100 * photo.covers).toFixed(0)} %, agrees ${(100 * photo.agreement).toFixed(0)} %${photo.cut_off ? ", cut off" : ""}${photo.mended ? ", mended" : ""}${photo.shown ? "" : ", only for refinement"}`;
+      const about = `mask ${(100 * photo.covers).toFixed(0)} %, agrees ${(100 * photo.agreement).toFixed(0)} %${photo.cut_off ? ", cut off" : ""}${photo.edited ? ", edited" : ""}${photo.shown ? "" : ", only for refinement"}`;
       const see = make("button", { type: "button", class: "look", "aria-pressed": String(looking === k), "aria-label": `Photo ${k + 1}, ${photo.name}: look through its camera` },
         make("img", { class: "whole", alt: "", src: `/jobs/${now.id}/photos/${k}.png`, loading: "lazy" }),
         make("img", { class: "cut", alt: "", src: `/jobs/${now.id}/views/${k}.png?v=${photo.covers}`, loading: "lazy" }));
@@ -424,10 +424,10 @@
         look(looking === k ? null : k);
         if (looking !== null) box("views").scrollIntoView({ block: "nearest" });
       });
-      const mend = make("button", { type: "button", "aria-label": `Mend the mask of photo ${k + 1}` }, "Mend mask");
-      mend.hidden = !now.may_go;
-      mend.addEventListener("click", () => void attempt(() => openBrush(k)));
-      return make("li", {}, see, make("span", { class: "small" }, `${k + 1} ${photo.name}: ${about}`), mend);
+      const edit = make("button", { type: "button", "aria-label": `Edit the mask of photo ${k + 1}` }, "Edit mask");
+      edit.hidden = !now.may_go;
+      edit.addEventListener("click", () => void attempt(() => openBrush(k)));
+      return make("li", {}, see, make("span", { class: "small" }, `${k + 1} ${photo.name}: ${about}`), edit);
     }));
   };
 
@@ -620,7 +620,7 @@
     const mask = context.getImageData(0, 0, width, height).data.filter((_, i) => i % 4 === 3);
     brush = { k, whole, mask, width, height, undo: [], at: [width / 2, height / 2] };
     Object.assign(paint, { width, height });
-    box("brush-title").textContent = `Mend the mask of photo ${k + 1}`;
+    box("brush-title").textContent = `Edit the mask of photo ${k + 1}`;
     dialog.showModal();
     paint.focus();
     showMask();

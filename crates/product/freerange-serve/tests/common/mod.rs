@@ -17,7 +17,7 @@ use std::{
 
 use freerange_gaussians::{Gaussians, channel};
 use freerange_scene::camera::{Camera, View};
-use freerange_scene::estimate::OthersShow;
+use freerange_scene::estimate::LeaveOneOut;
 use freerange_serve::{Engine, EngineError, Example, JobOptions, Outcome, Scene, ServeConfig, Server, Step, Stopper};
 use image::RgbaImage;
 use serde_json::Value;
@@ -83,7 +83,7 @@ impl Engine for Fake {
         Ok((0..views.len()).collect())
     }
 
-    fn others_show(&self) -> Option<OthersShow> {
+    fn leave_one_out(&self) -> Option<LeaveOneOut> {
         None
     }
 

@@ -5,7 +5,7 @@
 //! (docs/research/experiments/initial-fits.md). Cost: a third of a second for that fit.
 
 use freerange_gaussians::Gaussians;
-use freerange_optim::{frame_of, quick_fit};
+use freerange_optim::{frame_of, initial_fit};
 use freerange_scene::camera::{Similarity, View, Window};
 use freerange_util::Note;
 
@@ -66,7 +66,7 @@ impl CanonicalScene {
             let shown = scene.network_views();
             let place = &scene.canonical_from_user;
             let found = watch
-                .fit(Stage::Canonicalize, fit.iterations, place, |progress| quick_fit(&shown, fit, 0, progress))?;
+                .fit(Stage::Canonicalize, fit.iterations, place, |progress| initial_fit(&shown, fit, 0, progress))?;
             scene.fit = Some(found);
             if !frame.kept {
                 scene.recenter(&shown)?;

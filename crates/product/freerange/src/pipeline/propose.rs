@@ -8,7 +8,7 @@ use std::ops::ControlFlow;
 
 use freerange_diffusion::sample::FlowSampler;
 use freerange_gaussians::Gaussians;
-use freerange_optim::quick_fit;
+use freerange_optim::initial_fit;
 use freerange_util::side_by_side;
 
 use super::{
@@ -74,9 +74,9 @@ fn fits(
         let previewed = i == 0;
         move |tell: &mut dyn FnMut((f64, Option<Gaussians>)) -> ControlFlow<()>| match known(number) {
             Some(known) => Ok(known.clone()),
-            None => {
-                quick_fit(evidence.clone(), &config.fit, number, |p| tell((p.loss, previewed.then(|| p.cloud.clone()))))
-            }
+            None => initial_fit(evidence.clone(), &config.fit, number, |p| {
+                tell((p.loss, previewed.then(|| p.cloud.clone())))
+            }),
         }
     });
     let mut stopped = Ok(());

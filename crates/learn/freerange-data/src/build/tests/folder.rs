@@ -107,7 +107,7 @@ fn a_folder_returns_the_generated_objects() {
     assert_eq!((report.objects, report.shards, report.bytes), (5, 3, summary.bytes));
     assert_eq!((report.views, report.image_size), (Some(20), Some([32, 32])));
     assert_eq!(report.statistics[&5], statistics.normalization().unwrap());
-    assert_eq!(report.licences, BTreeMap::from([("CC0-1.0".into(), 5)]));
+    assert_eq!(report.licenses, BTreeMap::from([("CC0-1.0".into(), 5)]));
 
     let some = |n: u64| (0..n).map(|i| Ok((shards.object(i)?, shards.leaves(i)?))).collect::<Vec<_>>().into_iter();
     let sheet = contact_sheet(some(3), 2).unwrap();

@@ -119,7 +119,7 @@ fn messages_name_shard_object_and_entry() {
     refused(&edit(1, "\"cx\":2.7", "\"cx\":null"), "cameras.json", "null");
     refused(&|e| e[2].1[0] = 0xff, "gaussians.safetensors", "safetensors");
     refused(&|e| e[2].1.truncate(100), "gaussians.safetensors", "safetensors");
-    // The slices in 32 bits come first, then two fits, as they are and mended, of four Gaussians in 16 bits each.
+    // The slices in 32 bits come first, then two fits, as they are and target, of four Gaussians in 16 bits each.
     let fits = 4 * 4 * channel::COUNT * 2;
     let nan = |after: usize| {
         move |e: &mut Entries| {
@@ -127,7 +127,7 @@ fn messages_name_shard_object_and_entry() {
             e[2].1[end - 4..end].copy_from_slice(&f32::NAN.to_le_bytes());
         }
     };
-    refused(&nan(0), "gaussians.safetensors", "input_fit_01_mended");
+    refused(&nan(0), "gaussians.safetensors", "input_fit_01_target");
     refused(&nan(fits), "gaussians.safetensors", "depth_03");
     let unnamed = |e: &mut Entries| {
         let at = e[2].1.windows(14).position(|w| w == b"\"input_fit_01\"").unwrap();

@@ -61,7 +61,7 @@ fn toy(seed: u64) -> Object {
     // Numbers that 16 bits hold.
     let mut fit =
         || Gaussians::from_rows((0..4 * channel::COUNT).map(|_| f32::from(rng.random::<i8>()) / 64.0).collect());
-    let input_fits = [vec![1], vec![1, 0]].map(|views| InputFit { views, gaussians: fit(), mended: fit() }).to_vec();
+    let input_fits = [vec![1], vec![1, 0]].map(|views| InputFit { views, gaussians: fit(), target: fit() }).to_vec();
     Object { id: generated_id(seed), views, slices, input_fits }
 }
 
@@ -94,7 +94,7 @@ fn metadata_of(object: &Object) -> Metadata {
     Metadata {
         id: object.id.clone(),
         source: "noise".into(),
-        licence: "CC0-1.0".into(),
+        license: "CC0-1.0".into(),
         file_sha256: None,
         notes: vec!["one".into()],
         seed: 3,

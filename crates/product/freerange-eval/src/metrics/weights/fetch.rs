@@ -5,21 +5,16 @@ use std::{
     fs::File,
     io::{Read, Write},
     path::{Path, PathBuf},
-    time::Duration,
 };
 
-use freerange_util::{beside, hex, persist, write_atomically};
-use hf_hub::{
-    Repo, RepoType,
-    api::sync::{ApiBuilder, ApiError},
-};
-use sha2::{Digest, Sha256};
+use freerange_model::hub::{self, HubError};
+use freerange_util::{beside, persist, write_atomically};
 use tempfile::NamedTempFile;
 
 use super::{NOTE, Origin, WeightFile, WeightSet, check, is_there, members, note_of, set};
 use crate::metrics::MetricsError;
 
-/// The largest download.
+/// Largest member of an archive, in bytes.
 const LARGEST: u64 = 8 << 30;
 
 /// How weights are downloaded.
@@ -64,9 +59,7 @@ pub(super) fn fetch_set(
     options: &FetchOptions,
     progress: &mut dyn FnMut(&str, u64, Option<u64>),
 ) -> Result<Vec<PathBuf>, MetricsError> {
-    let wait = Some(Duration::try_from_secs_f64(options.timeout).unwrap_or(Duration::from_secs(60)));
-    let config = ureq::Agent::config_builder().timeout_connect(wait).timeout_recv_response(wait).build();
-    let mut client = Client { agent: config.into(), options, progress };
+    let mut client = Client { hub: hub::Client::new(&options.hub, options.timeout), progress };
     let mut archives = BTreeSet::new();
     for file in set.files {
         if is_intact(folder, file)? {
@@ -74,14 +67,12 @@ pub(super) fn fetch_set(
         }
         match file.origin {
             Origin::Hub { repository, path } => {
-                let (url, published) = client.hub_file(repository, path)?;
-                client.file(
-                    &url,
-                    &folder.join(file.path),
-                    if published.is_empty() { file.sha256 } else { &published },
-                )?;
+                let commit = client.hub.commit(repository, "main")?;
+                let (entry, url) = client.hub.entry(repository, &commit, path)?;
+                let published = entry.sha256.as_deref().unwrap_or(file.sha256);
+                client.file(&url, &folder.join(file.path), Some(entry.size), published)?;
             }
-            Origin::Url(url) => client.file(url, &folder.join(file.path), file.sha256)?,
+            Origin::Url(url) => client.file(url, &folder.join(file.path), None, file.sha256)?,
             Origin::Zip { url, .. } => {
                 if archives.insert(url) {
                     client.archive(url, folder, set)?;
@@ -111,75 +102,35 @@ fn is_intact(folder: &Path, file: &WeightFile) -> Result<bool, MetricsError> {
     Ok(true)
 }
 
+impl From<HubError> for MetricsError {
+    fn from(e: HubError) -> Self {
+        match e {
+            HubError::Download { url, reason } => Self::Download { url, reason },
+            HubError::Io(e) => Self::io(&e.path, e.source),
+            e => Self::Download { url: String::new(), reason: e.to_string() },
+        }
+    }
+}
+
 struct Client<'a> {
-    agent: ureq::Agent,
-    options: &'a FetchOptions,
+    hub: hub::Client,
     progress: &'a mut dyn FnMut(&str, u64, Option<u64>),
 }
 
 impl Client<'_> {
-    /// A hub file's address, at the commit that the main branch is at, and its SHA-256 where the hub keeps one (of
-    /// large files it is the ETag; small ones have a Git hash, which is shorter).
-    fn hub_file(&self, repository: &str, path: &str) -> Result<(String, String), MetricsError> {
-        let fail = |url: &str, e: ApiError| MetricsError::Download { url: url.to_owned(), reason: e.to_string() };
-        let api =
-            ApiBuilder::new().with_endpoint(self.options.hub.clone()).with_progress(false).with_token(None).build();
-        let api = api.map_err(|e| fail(&self.options.hub, e))?;
-        let url = |revision: &str| {
-            api.repo(Repo::with_revision(repository.to_owned(), RepoType::Model, revision.to_owned())).url(path)
-        };
-        let main = url("main");
-        let metadata = api.metadata(&main).map_err(|e| fail(&main, e))?;
-        let commit = metadata.commit_hash();
-        let is_hex = |text: &str| text.bytes().all(|b| b.is_ascii_hexdigit());
-        if commit.len() != 40 || !is_hex(commit) {
-            return Err(MetricsError::Download {
-                url: main,
-                reason: format!("the hub names no commit but {commit:?}"),
-            });
-        }
-        let etag = metadata.etag();
-        let published = if etag.len() == 64 && is_hex(etag) { etag.to_lowercase() } else { String::new() };
-        Ok((url(commit), published))
-    }
-
     /// Downloads to a temporary file beside `target`, and returns it with its hash.
-    fn download(&mut self, url: &str, target: &Path) -> Result<(NamedTempFile, String), MetricsError> {
-        let fail = |reason: String| MetricsError::Download { url: url.to_owned(), reason };
-        let response = self.agent.get(url).call().map_err(|e| fail(e.to_string()))?;
-        let total = response.body().content_length();
-        if total.is_some_and(|n| n > LARGEST) {
-            return Err(fail(format!("the file has {} bytes, expected at most {LARGEST}", total.unwrap_or(0))));
-        }
-        let folder = target.parent().unwrap_or(Path::new("."));
-        std::fs::create_dir_all(folder).map_err(|e| MetricsError::io(folder, e))?;
-        let mut file = beside(target).map_err(|e| MetricsError::io(folder, e))?;
+    fn download(
+        &mut self,
+        url: &str,
+        target: &Path,
+        size: Option<u64>,
+    ) -> Result<(NamedTempFile, String), MetricsError> {
         let name = target.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let mut body = response.into_body().into_reader();
-        let mut hash = Sha256::new();
-        let mut buffer = vec![0; 1 << 18];
-        let mut done = 0;
-        loop {
-            let n = body.read(&mut buffer).map_err(|e| fail(format!("after {done} bytes: {e}")))?;
-            if n == 0 {
-                break;
-            }
-            done += n as u64;
-            if done > LARGEST {
-                return Err(fail(format!("more than {LARGEST} bytes came")));
-            }
-            hash.update(&buffer[..n]);
-            file.write_all(&buffer[..n]).map_err(|e| MetricsError::io(folder, e))?;
-            (self.progress)(&name, done, total);
-        }
-        match total {
-            Some(total) if total != done => Err(fail(format!("cut short: {done} of {total} bytes came"))),
-            _ => Ok((file, hex(&hash.finalize()))),
-        }
+        Ok(self.hub.file(url, target, size, &mut |done, total| (self.progress)(&name, done, total))?)
     }
 
-    fn file(&mut self, url: &str, target: &Path, published: &str) -> Result<(), MetricsError> {
-        let (file, found) = self.download(url, target)?;
+    fn file(&mut self, url: &str, target: &Path, size: Option<u64>, published: &str) -> Result<(), MetricsError> {
+        let (file, found) = self.download(url, target, size)?;
         if !found.starts_with(published) {
             let (path, expected) = (target.to_owned(), published.to_owned());
             return Err(MetricsError::Checksum { path, expected, found });
@@ -190,7 +141,7 @@ impl Client<'_> {
     /// Downloads an archive and unpacks the members that `set` wants of it.
     fn archive(&mut self, url: &str, folder: &Path, set: &WeightSet) -> Result<(), MetricsError> {
         let name = url.rsplit('/').next().unwrap_or(url);
-        let (file, _) = self.download(url, &folder.join(name))?;
+        let (file, _) = self.download(url, &folder.join(name), None)?;
         let fail = |reason: String| MetricsError::Download { url: url.to_owned(), reason };
         let open = File::open(file.path()).map_err(|e| MetricsError::io(file.path(), e))?;
         let mut archive = zip::ZipArchive::new(open).map_err(|e| fail(e.to_string()))?;

@@ -93,7 +93,7 @@ fn sha(bytes: &[u8]) -> String {
 }
 
 fn set_of(files: Vec<WeightFile>) -> WeightSet {
-    WeightSet { name: "test", purpose: "", licence: "", files: files.leak() }
+    WeightSet { name: "test", purpose: "", license: "", files: files.leak() }
 }
 
 fn quiet(_: &str, _: u64, _: Option<u64>) {}

@@ -18,8 +18,8 @@ pub struct WeightSet {
     pub name: &'static str,
     /// What it is for.
     pub purpose: &'static str,
-    /// The licence that its authors publish it under.
-    pub licence: &'static str,
+    /// The license that its authors publish it under.
+    pub license: &'static str,
     /// The files, in the order in which networks are built from them.
     pub files: &'static [WeightFile],
 }
@@ -100,7 +100,7 @@ pub const SETS: &[WeightSet] = &[
     WeightSet {
         name: "lpips-alex",
         purpose: "LPIPS on AlexNet",
-        licence: "backbone BSD-3-Clause (torchvision), heads BSD-2-Clause (lpips)",
+        license: "backbone BSD-3-Clause (torchvision), heads BSD-2-Clause (lpips)",
         files: &[
             or(
                 url(
@@ -121,7 +121,7 @@ pub const SETS: &[WeightSet] = &[
     WeightSet {
         name: "lpips-vgg",
         purpose: "LPIPS on VGG16",
-        licence: "backbone BSD-3-Clause (torchvision), heads BSD-2-Clause (lpips)",
+        license: "backbone BSD-3-Clause (torchvision), heads BSD-2-Clause (lpips)",
         files: &[
             or(
                 url("vgg16-397923af.pth", "https://download.pytorch.org/models/vgg16-397923af.pth", "397923af"),
@@ -138,7 +138,7 @@ pub const SETS: &[WeightSet] = &[
     WeightSet {
         name: "fid",
         purpose: "FID: Inception-v3 of TensorFlow's 2015 graph, as pytorch-fid publishes it",
-        licence: "Apache-2.0 (pytorch-fid)",
+        license: "Apache-2.0 (pytorch-fid)",
         files: &[url(
             "pt_inception-2015-12-05-6726825d.pth",
             "https://github.com/mseitzer/pytorch-fid/releases/download/fid_weights/pt_inception-2015-12-05-6726825d.pth",
@@ -148,7 +148,7 @@ pub const SETS: &[WeightSet] = &[
     WeightSet {
         name: "dinov2-small",
         purpose: "DINO similarity; image encoder",
-        licence: "Apache-2.0",
+        license: "Apache-2.0",
         files: &[
             hub("dinov2-small/model.safetensors", "facebook/dinov2-small", "model.safetensors"),
             hub("dinov2-small/config.json", "facebook/dinov2-small", "config.json"),
@@ -157,7 +157,7 @@ pub const SETS: &[WeightSet] = &[
     WeightSet {
         name: "dinov2-base",
         purpose: "DINO similarity; image encoder",
-        licence: "Apache-2.0",
+        license: "Apache-2.0",
         files: &[
             hub("dinov2-base/model.safetensors", "facebook/dinov2-base", "model.safetensors"),
             hub("dinov2-base/config.json", "facebook/dinov2-base", "config.json"),
@@ -166,7 +166,7 @@ pub const SETS: &[WeightSet] = &[
     WeightSet {
         name: "dinov2-large",
         purpose: "DINO similarity; image encoder",
-        licence: "Apache-2.0",
+        license: "Apache-2.0",
         files: &[
             hub("dinov2-large/model.safetensors", "facebook/dinov2-large", "model.safetensors"),
             hub("dinov2-large/config.json", "facebook/dinov2-large", "config.json"),
@@ -175,7 +175,7 @@ pub const SETS: &[WeightSet] = &[
     WeightSet {
         name: "dreamsim",
         purpose: "DreamSim, the ensemble of DINO, CLIP and OpenCLIP",
-        licence: "adapter and CLIP MIT (dreamsim, CLIP, OpenCLIP), DINO Apache-2.0",
+        license: "adapter and CLIP MIT (dreamsim, CLIP, OpenCLIP), DINO Apache-2.0",
         files: &[
             DINO_B16,
             member("dreamsim_ensemble/clip_vitb16_pretrain.pth.tar", DREAMSIM_ENSEMBLE, "clip_vitb16_pretrain.pth.tar"),
@@ -190,7 +190,7 @@ pub const SETS: &[WeightSet] = &[
     WeightSet {
         name: "dreamsim-dino",
         purpose: "DreamSim, the single DINO ViT-B/16",
-        licence: "adapter MIT (dreamsim), DINO Apache-2.0",
+        license: "adapter MIT (dreamsim), DINO Apache-2.0",
         files: &[
             DINO_B16,
             member("dreamsim_dino_vitb16/dino_vitb16_single_lora/", DREAMSIM_DINO, "dino_vitb16_single_lora/"),

@@ -6,7 +6,7 @@ use super::*;
 fn the_table_is_consistent() {
     for (i, set) in SETS.iter().enumerate() {
         assert!(SETS[..i].iter().all(|other| other.name != set.name), "{} twice", set.name);
-        assert!(!set.files.is_empty() && !set.licence.is_empty() && !set.purpose.is_empty());
+        assert!(!set.files.is_empty() && !set.license.is_empty() && !set.purpose.is_empty());
         for file in set.files {
             assert!(file.sha256.len() <= 64 && file.sha256.bytes().all(|b| b.is_ascii_hexdigit()));
             // PyTorch's hub writes the hash's first digits before the ending.

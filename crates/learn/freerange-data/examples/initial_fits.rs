@@ -1,13 +1,13 @@
 //! What a quick fit of four views is worth, by its settings: PSNR in dB on held-out views of generated objects over
 //! white, of the fit and of its slice of 1,024 Gaussians, and seconds.
-//! `cargo run --release -p freerange-data --example quick_fits -- OBJECTS ITERATIONS GAUSSIANS SIZE [ITERATIONS GAUSSIANS SIZE ...]`
+//! `cargo run --release -p freerange-data --example initial_fits -- OBJECTS ITERATIONS GAUSSIANS SIZE [ITERATIONS GAUSSIANS SIZE ...]`
 
 use std::{ops::ControlFlow, time::Instant};
 
 use freerange_data::Object;
 use freerange_data::build::{ObjectConfig, generate_object};
 use freerange_gaussians::Gaussians;
-use freerange_optim::{QuickFitConfig, quick_fit, tree_slice};
+use freerange_optim::{InitialFitConfig, initial_fit, tree_slice};
 use freerange_raster::metrics::psnr;
 use freerange_raster::{RasterConfig, render};
 use freerange_scene::camera::{SelectionConfig, View, image_ops::composite, select_views};
@@ -28,7 +28,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         "| iterations | Gaussians | px | full: fit | slice | partial: fit | slice | s |\n|---|---|---|---|---|---|---|---|"
     );
     for setting in settings.chunks_exact(3) {
-        let quick = QuickFitConfig { iterations: setting[0], gaussians: setting[1], render_size: setting[2] as u32 };
+        let quick = InitialFitConfig { iterations: setting[0], gaussians: setting[1], render_size: setting[2] as u32 };
         let begin = Instant::now();
         let scores: Vec<[f64; 4]> = objects.par_iter().map(|o| scores(o, &quick)).collect();
         let seconds = begin.elapsed().as_secs_f64() / (2 * objects.len()) as f64;
@@ -43,13 +43,13 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
 }
 
 /// Of the fit and its slice, from views all around and from one side.
-fn scores(object: &Object, quick: &QuickFitConfig) -> [f64; 4] {
+fn scores(object: &Object, quick: &InitialFitConfig) -> [f64; 4] {
     let centers: Vec<DVec3> = object.views.iter().map(|v| v.camera.center()).collect();
     let sets = select_views(&centers, DVec3::ZERO, &SelectionConfig::default()).expect("enough views");
     let mut scores = [0.0; 4];
     for (k, inputs) in [&sets.full, &sets.partial].into_iter().enumerate() {
         let inputs: Vec<View> = inputs.iter().map(|&i| object.views[i].clone()).collect();
-        let cloud = quick_fit(&inputs, quick, 1, |_| ControlFlow::Continue(())).expect("a fit");
+        let cloud = initial_fit(&inputs, quick, 1, |_| ControlFlow::Continue(())).expect("a fit");
         let slice = tree_slice(&cloud, 10).expect("a slice");
         for (j, cloud) in [cloud, slice].into_iter().enumerate() {
             let sum: f64 = sets.validation.iter().map(|&i| score(&cloud, &object.views[i])).sum();

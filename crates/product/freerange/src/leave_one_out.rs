@@ -3,7 +3,7 @@
 use std::ops::ControlFlow;
 
 use freerange_gaussians::Gaussians;
-use freerange_optim::{QuickFitConfig, quick_fit};
+use freerange_optim::{InitialFitConfig, initial_fit};
 use freerange_raster::RasterConfig;
 use freerange_scene::camera::{Camera, FrameConfig, View, Window};
 use image::{Rgba, RgbaImage};
@@ -12,17 +12,17 @@ use rayon::prelude::*;
 use crate::{Error, error::Lift, to_canonical};
 
 /// Shows each view as a quick fit of all the others has it: straight color and alpha, at its image's size, in the order of `views`, whose
-/// alpha is the object's mask. What one mask lacks by mistake others have, and the other way round. (`freerange_scene::estimate::OthersShow`.)
+/// alpha is the object's mask. What one mask lacks by mistake others have, and the other way round. (`freerange_scene::estimate::LeaveOneOut`.)
 ///
 /// # Errors
 /// A sentence, where the views do not show one object from different places, or a fit diverges.
-pub fn others_show(views: &[View]) -> Result<Vec<RgbaImage>, String> {
+pub fn leave_one_out(views: &[View]) -> Result<Vec<RgbaImage>, String> {
     shown(views).map_err(|e| e.to_string())
 }
 
 fn shown(views: &[View]) -> Result<Vec<RgbaImage>, Error> {
     // Finer or longer fits mend no more (docs/research/experiments/masks.md).
-    let config = QuickFitConfig { iterations: 150, gaussians: 2048, render_size: 128 };
+    let config = InitialFitConfig { iterations: 150, gaussians: 2048, render_size: 128 };
     let (_, canonical) = to_canonical(views, &FrameConfig::default())?;
     let framed = |v: &View| Window::framed(v).map_or_else(|| v.clone(), |w| w.cut(v).into_owned());
     let framed: Vec<View> = canonical.iter().map(framed).collect();
@@ -31,7 +31,7 @@ fn shown(views: &[View]) -> Result<Vec<RgbaImage>, Error> {
         .map(|i| {
             let others: Vec<View> =
                 framed.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, v)| v.clone()).collect();
-            let cloud = quick_fit(&others, &config, i as u64, |_| ControlFlow::Continue(())).lift()?;
+            let cloud = initial_fit(&others, &config, i as u64, |_| ControlFlow::Continue(())).lift()?;
             picture(&cloud, &canonical[i].camera)
         })
         .collect()

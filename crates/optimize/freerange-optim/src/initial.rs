@@ -7,10 +7,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::{Evidence, FitConfig, FitError, FitProgress, config::check, fit};
 
-/// Settings of [`quick_fit`].
+/// Settings of [`initial_fit`].
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct QuickFitConfig {
+pub struct InitialFitConfig {
     /// Optimization steps, one view each.
     pub iterations: usize,
     /// Number of Gaussians.
@@ -19,13 +19,13 @@ pub struct QuickFitConfig {
     pub render_size: u32,
 }
 
-impl Default for QuickFitConfig {
+impl Default for InitialFitConfig {
     fn default() -> Self {
         Self { iterations: 200, gaussians: 1024, render_size: 128 }
     }
 }
 
-impl QuickFitConfig {
+impl InitialFitConfig {
     /// Refuses values that no fit can work with.
     pub fn check(&self) -> Result<(), FitError> {
         check("iterations", "1 to 100000", self.iterations, (1..=100_000).contains(&self.iterations))?;
@@ -53,9 +53,9 @@ impl QuickFitConfig {
 ///
 /// # Errors
 /// Those of [`fit`].
-pub fn quick_fit<'a>(
+pub fn initial_fit<'a>(
     seen: impl Into<Evidence<'a>>,
-    config: &QuickFitConfig,
+    config: &InitialFitConfig,
     seed: u64,
     progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Gaussians, FitError> {
@@ -68,15 +68,15 @@ pub fn quick_fit<'a>(
 ///
 /// # Errors
 /// Those of [`fit`].
-pub(crate) fn polish<'a>(
+pub(crate) fn continue_fit<'a>(
     cloud: &Gaussians,
     seen: impl Into<Evidence<'a>>,
-    config: &QuickFitConfig,
+    config: &InitialFitConfig,
     seed: u64,
     progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Gaussians, FitError> {
     config.check()?;
-    let own = QuickFitConfig { gaussians: cloud.len(), ..config.clone() };
+    let own = InitialFitConfig { gaussians: cloud.len(), ..config.clone() };
     fit(seen, Some(cloud), &own.config(seed), progress)
 }
 

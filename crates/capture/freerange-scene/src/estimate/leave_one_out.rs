@@ -1,4 +1,4 @@
-//! Masks mended with what the other views show: a quick fit of all the others says where the object is in a view, and in which color.
+//! Masks refined with what the other views show: a quick fit of all the others says where the object is in a view, and in which color.
 
 use super::mask::{enlarged, smooth};
 use super::odds::odds;
@@ -11,15 +11,15 @@ use crate::camera::{View, image_ops::resize_area};
 use image::RgbaImage;
 use rayon::prelude::*;
 
-/// Times that masks are mended, and the fewest views of which the others know enough for it.
-pub(super) const MENDING: usize = 2;
-pub(super) const LEAST_TO_MEND: usize = 5;
+/// Times that masks are refined, and the fewest views of which the others know enough for it.
+pub(super) const ROUNDS: usize = 2;
+pub(super) const LEAST_VIEWS: usize = 5;
 /// Log odds against what lies outside of the hull, beside what the other views show.
-pub(super) const OUTSIDE_MENDING: f32 = 1.0;
+pub(super) const OUTSIDE_HULL: f32 = 1.0;
 
 /// Shows each view as all the others have it, by whatever makes a shape of views: straight color and alpha, in the order and size of the
 /// views, whose alpha is the masks as they are so far. Or says why not.
-pub type OthersShow = fn(&[View]) -> Result<Vec<RgbaImage>, String>;
+pub type LeaveOneOut = fn(&[View]) -> Result<Vec<RgbaImage>, String>;
 
 impl Stage {
     /// Each view as the others have it, on a larger picture.
@@ -27,7 +27,7 @@ impl Stage {
         &self,
         views: &[View],
         last: &Masks,
-        show: OthersShow,
+        show: LeaveOneOut,
     ) -> Result<Vec<RgbaImage>, String> {
         let cut_out: Vec<View> = (0..views.len())
             .map(|i| {
@@ -48,7 +48,7 @@ impl Stage {
     }
 
     /// Cuts all views once more, with what the other views show of each.
-    pub(super) fn mend(&self, last: &Masks, shown: Vec<RgbaImage>) -> Result<Masks, SceneError> {
+    pub(super) fn refine(&self, last: &Masks, shown: Vec<RgbaImage>) -> Result<Masks, SceneError> {
         let count = self.pictures.len();
         let near: Vec<Vec<f32>> = (0..count).map(|i| self.nearness(i)).collect();
         let background = self.background(&last.masks);
@@ -73,12 +73,12 @@ impl Stage {
             .map(|i| {
                 let [shown, _] = &shown[i];
                 let odds = odds(&self.pictures[i], &object, &behind, tables[i].as_ref(), Some(shown), |_| true);
-                let outside = |k: usize| if last.outlines[i][k] { 0.0 } else { OUTSIDE_MENDING };
+                let outside = |k: usize| if last.outlines[i][k] { 0.0 } else { OUTSIDE_HULL };
                 self.cut(i, &near[i], &odds, Some(&last.outlines[i]), |k| odds[k] + shown.odds(k) - outside(k))
             })
             .collect();
         let outlines = self.outlines(&masks).ok_or_else(|| SceneError::NotCutOut {
-            reason: "no point of space lies within all masks once they are mended with what other views show".into(),
+            reason: "no point of space lies within all masks once they are refined with what other views show".into(),
         })?;
         Ok(Masks { masks, clearness: last.clearness.clone(), object, background: behind, outlines, shown })
     }
