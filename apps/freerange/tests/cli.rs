@@ -113,6 +113,8 @@ fn reconstruct_writes_everything_and_its_cloud_can_be_rendered_from_the_users_ca
         cameras.to_str().unwrap(),
         "-o",
         renders.to_str().unwrap(),
+        "--depth",
+        "--normals",
     ]);
     assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
     let views = report["samples"][0]["further_views"]["views"].as_array().unwrap().clone();
@@ -124,7 +126,31 @@ fn reconstruct_writes_everything_and_its_cloud_can_be_rendered_from_the_users_ca
         let to_floats = |i: &image::RgbaImage| freerange_scene::camera::image_ops::composite(i, [1.0; 3]);
         let psnr = freerange_raster::metrics::psnr(&to_floats(&render), &to_floats(&truth)).unwrap();
         assert!((psnr - view["psnr"].as_f64().unwrap()).abs() < 0.05, "{name}: {psnr} against {}", view["psnr"]);
+        surface_is_where_the_object_is(&renders, &name, &truth);
     }
+}
+
+/// Depth and normals of a render, against the photo from there: a surface where the photo has the object, facing it.
+fn surface_is_where_the_object_is(renders: &Path, name: &str, truth: &image::RgbaImage) {
+    let depth = fs::read(renders.join(format!("{name}_depth.npy"))).unwrap();
+    assert_eq!(&depth[..8], b"\x93NUMPY\x01\x00");
+    let start = 10 + usize::from(u16::from_le_bytes([depth[8], depth[9]]));
+    let header = std::str::from_utf8(&depth[10..start]).unwrap();
+    let (width, height) = truth.dimensions();
+    assert!(start.is_multiple_of(64) && header.ends_with('\n'), "{header:?}");
+    assert!(header.contains("'<f4'") && header.contains(&format!("({height}, {width})")), "{header}");
+    let depth: Vec<f32> = depth[start..].chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect();
+    let normals = image::open(renders.join(format!("{name}_normals.png"))).unwrap().to_rgba8();
+    assert_eq!((depth.len(), normals.dimensions()), ((width * height) as usize, (width, height)));
+    let (mut agree, mut facing, mut surface) = (0, 0, 0);
+    for ((z, normal), pixel) in depth.iter().zip(normals.pixels()).zip(truth.pixels()) {
+        agree += usize::from(z.is_finite() == (pixel[3] > 127));
+        surface += usize::from(normal[3] == 255);
+        facing += usize::from(normal[3] == 255 && normal[2] > 127);
+        assert!(z.is_infinite() || *z > 0.0);
+    }
+    assert!(agree as f64 > 0.97 * depth.len() as f64, "{name}: {agree} of {}", depth.len());
+    assert!(surface > 1000 && facing as f64 > 0.9 * surface as f64, "{name}: {facing} of {surface}");
 }
 
 #[test]

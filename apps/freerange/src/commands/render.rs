@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use freerange::pictures::render_splats;
+use freerange::pictures::{render_splats, render_surface};
 use freerange_gaussians::RenderMode;
 use freerange_gaussians::formats::{Format, Frames, Loaded, read};
 use freerange_scene::camera::{image_ops::to_picture, load_cameras};
@@ -27,6 +27,12 @@ pub struct Args {
     /// Antialiasing: default (0.3 square pixels) or mip (0.1, with compensated opacities) [default: the file's].
     #[arg(long, value_name = "MODE", value_parser = parse_mode)]
     mode: Option<RenderMode>,
+    /// Also the depth of the surface: NAME_depth.npy, camera z in the file's units, float32; infinite where nothing is.
+    #[arg(long)]
+    depth: bool,
+    /// Also its normals: NAME_normals.png, as (n + 1) / 2 with x right, y up and z toward the camera; transparent where nothing is.
+    #[arg(long)]
+    normals: bool,
     /// Output folder.
     #[arg(short, long, default_value = "renders")]
     output: PathBuf,
@@ -61,10 +67,43 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         let picture = to_picture(&render_splats(&splats, camera, mode)?, camera.width, camera.height);
         let name = name.rsplit(['/', '\\']).next().unwrap_or("view");
         output.picture(&format!("{name}.png"), &picture)?;
+        if args.depth || args.normals {
+            let (depth, normals) = render_surface(&splats, camera)?;
+            if args.depth {
+                output.write(&format!("{name}_depth.npy"), &npy(&depth, [camera.height, camera.width]))?;
+            }
+            if args.normals {
+                output.picture(&format!("{name}_normals.png"), &picture_of(&normals, camera.width))?;
+            }
+        }
         bar.at(i as u64 + 1, name);
     }
     bar.finish();
     output.commit()?;
     println!("{} images in {}", cameras.len(), args.output.display());
     Ok(())
+}
+
+/// A float32 array as NumPy's format 1.0 has it
+/// (<https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html>).
+fn npy(values: &[f32], [rows, columns]: [u32; 2]) -> Vec<u8> {
+    let mut header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({rows}, {columns}), }}");
+    // Ten bytes before it, a line feed after it, in all a multiple of 64.
+    let padding = (64 - (10 + header.len() + 1) % 64) % 64;
+    header.extend(std::iter::repeat_n(' ', padding).chain(['\n']));
+    let length = u16::try_from(header.len()).expect("a short header").to_le_bytes();
+    let values = values.iter().flat_map(|v| v.to_le_bytes());
+    b"\x93NUMPY\x01\x00".iter().copied().chain(length).chain(header.bytes()).chain(values).collect()
+}
+
+/// Normals in camera coordinates as a picture with y up and z toward the camera.
+fn picture_of(normals: &[[f32; 3]], width: u32) -> image::RgbaImage {
+    let byte = |v: f32| (255.0 * (0.5 + 0.5 * v)).round() as u8;
+    let pixel = |&[x, y, z]: &[f32; 3]| match [x, y, z] {
+        [0.0, 0.0, 0.0] => [0; 4],
+        _ => [byte(x), byte(-y), byte(-z), 255],
+    };
+    let height = (normals.len() / width as usize) as u32;
+    let bytes = normals.iter().flat_map(pixel).collect();
+    image::RgbaImage::from_raw(width, height, bytes).expect("one normal per pixel")
 }

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use freerange_gaussians::{Gaussians, RenderMode, Splats};
-use freerange_raster::{MIP_BLUR, RasterConfig, mip_compensated, render};
+use freerange_raster::{MIP_BLUR, RasterConfig, mip_compensated, render, surface_depth, surface_normals};
 use freerange_scene::camera::{
     Camera,
     image_ops::{composite, to_picture},
@@ -49,6 +49,21 @@ pub fn render_splats(splats: &Splats, camera: &Camera, mode: RenderMode) -> Resu
     let rows = mip_compensated(cloud.rows(), &camera, MIP_BLUR);
     let config = RasterConfig { blur: MIP_BLUR, ..RasterConfig::default() };
     Ok(render(&rows, &[camera], &[WHITE], &config).lift()?.rgb)
+}
+
+/// Where the surface is that Gaussians from a file show, and which way it faces: camera z per pixel, in the file's
+/// units, infinite where half of the light or more passes; and unit normals in camera coordinates (x right, y down, z
+/// forward), zero there. `[h, w]` each.
+///
+/// # Errors
+/// If the rasterizer refuses the camera or the Gaussians.
+pub fn render_surface(splats: &Splats, camera: &Camera) -> Result<(Vec<f32>, Vec<[f32; 3]>), Error> {
+    let world_to_camera = camera.world_to_camera * DMat4::from_translation(splats.origin);
+    let camera = Camera { world_to_camera, ..*camera };
+    let cloud = &splats.cloud;
+    let depth = surface_depth(cloud.rows(), &camera, &in_units_of(cloud, &camera)).lift()?;
+    let normals = surface_normals(&depth, &camera);
+    Ok((depth, normals))
 }
 
 /// An image composited on white.

@@ -13,7 +13,7 @@
 //!   feature `gpu` and one that says how to reach the device (`cuda`, `metal`, `vulkan`, `webgpu`), also on GPUs.
 //! * [`render`], [`render_backward`]: the same on plain slices, without a tensor library.
 //! * [`metrics`]: how alike two images are, with gradients.
-//! * [`surface_depth`]: where the surface is that Gaussians show.
+//! * [`surface_depth`], [`surface_normals`]: where the surface is that Gaussians show, and which way it faces.
 //! * [`mod@reference`]: slow, in f64, for tests.
 //!
 //! Architecture invariant: no models and no training; without the feature `op` no tensor framework.
@@ -35,7 +35,7 @@ mod op;
 pub mod reference;
 
 pub use config::RasterConfig;
-pub use cpu::{Gradients, RenderOutput, render, render_backward, surface_depth};
+pub use cpu::{Gradients, RenderOutput, render, render_backward, surface_depth, surface_normals};
 pub use error::RasterError;
 pub use mip::{MIP_BLUR, mip_compensated};
 #[cfg(feature = "op")]

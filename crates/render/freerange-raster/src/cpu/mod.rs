@@ -6,10 +6,12 @@
 
 mod bin;
 mod math;
+mod normals;
 pub(crate) mod project;
 mod surface;
 mod tile;
 
+pub use normals::surface_normals;
 pub use surface::surface_depth;
 
 use crate::{CHANNELS, RasterConfig, RasterError};
