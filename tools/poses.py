@@ -83,7 +83,11 @@ def measure(args, capture, out):
         run = subprocess.run([str(c) for c in command], capture_output=True, text=True)
         seconds = time.time() - begin
         said = [l.replace(photos, "PHOTOS") for l in run.stderr.splitlines()]
-    found, off = {}, {}
+    found, off, placed = {}, {}, 0
+    if (out / "poses.json").is_file():
+        # Poses that are refused are not written, but counted.
+        models = json.loads((out / "poses.json").read_text())["engine"]["models"]
+        placed = models[0] if models else 0
     if (out / "sparse/0/images.bin").is_file():
         model = pycolmap.Reconstruction(str(out / "sparse/0"))
         found = {i.name: i.cam_from_world().rotation.matrix() for i in model.images.values()}
@@ -92,7 +96,7 @@ def measure(args, capture, out):
         if run.returncode == 0:
             aligned(frames, model, turn, agreed, out / "aligned.json")
     return {
-        "capture": capture.name, "exit": run.returncode, "photos": len(names), "placed": len(found),
+        "capture": capture.name, "exit": run.returncode, "photos": len(names), "placed": placed,
         "off": off, "seconds": seconds, "said": [l for l in said if l.startswith(("err", "warn", "note"))]}
 
 
