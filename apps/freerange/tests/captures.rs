@@ -151,7 +151,8 @@ fn ring(count: usize) -> Vec<View> {
         .collect()
 }
 
-/// Runs `poses` with an engine that finds these cameras, of photos in `folder`.
+/// Runs `poses` with an engine that finds these cameras, of photos in `folder`. `models`: photos in each; before a bar those that it finds
+/// under masks.
 #[cfg(unix)]
 fn posed(folder: &Path, views: &[View], found: &[View], models: &str, more: &[&str]) -> (i32, String, Option<Value>) {
     use std::os::unix::fs::PermissionsExt;
@@ -164,9 +165,11 @@ fn posed(folder: &Path, views: &[View], found: &[View], models: &str, more: &[&s
     let point = [(DVec3::ZERO, [0; 3])];
     freerange_scene::write_colmap(&model, found, DVec3::ZERO, &point).unwrap();
     let engine = folder.join("python");
+    let (masked, models) = models.split_once('|').unwrap_or((models, models));
     let script = format!(
-        "#!/bin/sh\nif [ \"$1\" = -c ]; then echo 0.0-test; exit 0; fi\nwork=$(dirname \"$2\")\nmkdir -p \"$work/model\"\n\
-         cp {}/sparse/0/*.bin \"$work/model/\"\necho '{{\"engine\": \"test\", \"models\": {models}, \"pairs\": \"neighbors\", \"points\": 1}}' \
+        "#!/bin/sh\nif [ \"$1\" = -c ]; then echo 0.0-test; exit 0; fi\nwork=$(dirname \"$2\")\nm='{models}'\n\
+         grep -q '\"masks\": null' \"$2\" || m='{masked}'\nmkdir -p \"$work/model\"\n\
+         cp {}/sparse/0/*.bin \"$work/model/\"\necho '{{\"engine\": \"test\", \"models\": '\"$m\"', \"pairs\": \"neighbors\", \"points\": 1}}' \
          > \"$work/result.json\"\n",
         model.display()
     );
@@ -210,6 +213,10 @@ fn poses_that_an_engine_finds_are_judged() {
     let found = freerange_scene::read::cameras(&folder.path().join("out"), None, None).unwrap();
     let loaded = freerange_scene::load(&found, &freerange_scene::LoadConfig::default()).unwrap();
     assert_eq!(loaded.masks, freerange_scene::MaskKind::Files);
+    // Where too little is found under them, what is beside them is looked at, too.
+    let (code, said, _) = posed(folder.path(), &views, &views, "[2]|[16]", &given);
+    assert!(code == 0 && said.contains("trying again with features beside the masks"), "{said}");
+    assert!(at("masks/15.png.png").is_file());
     fs::remove_file(masks.join("03.png")).unwrap();
     let (code, said, _) = posed(folder.path(), &views, &views, "[16]", &given);
     assert!(code == 0 && said.contains("15 of 16 photos have a mask"), "{said}");
@@ -264,7 +271,8 @@ fn poses_need_photos_and_an_engine() {
     let text = said(&["poses", path, "-o", out, "--python", "/nowhere/python"]);
     assert!(text.contains("/nowhere/python") && text.contains("pycolmap"), "{text}");
     // No engine at all: how to install one.
-    let done = Command::new(env!("CARGO_BIN_EXE_freerange")).args(["poses", path, "-o", out]).env("PATH", path).output();
+    let done =
+        Command::new(env!("CARGO_BIN_EXE_freerange")).args(["poses", path, "-o", out]).env("PATH", path).output();
     let done = done.unwrap();
     let text = String::from_utf8_lossy(&done.stderr);
     assert!(done.status.code() == Some(2) && text.contains("expected COLMAP on the PATH, or pycolmap"), "{text}");

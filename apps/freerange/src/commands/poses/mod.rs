@@ -86,16 +86,32 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         }
         std::fs::copy(photo, to).map_err(|e| CliError::file(photo, e))?;
     }
-    let (mut done, mut judgement) = attempt(args, &engine, &output, &photos, &names, NEIGHBORS)?;
+    let mut way = Way { neighbors: NEIGHBORS, masked: args.masks.is_some() };
+    let (mut done, mut judgement) = attempt(args, &engine, &output, &photos, &names, &way)?;
+    if way.masked && !judgement.refused.is_empty() {
+        // The turntable itself has features, too. Those of a background that stands still are filtered.
+        eprintln!("note: {}; trying again with features beside the masks", judgement.refused.join("; "));
+        way.masked = false;
+        (done, judgement) = attempt(args, &engine, &output, &photos, &names, &way)?;
+    }
     if judgement.in_doubt {
         // Photos that look alike are farther apart than those that follow one another: fewer pairs mix up fewer.
         eprintln!("note: {}; trying again with fewer neighbors", judgement.refused.join("; "));
-        (done, judgement) = attempt(args, &engine, &output, &photos, &names, 0.5 * NEIGHBORS)?;
+        way.neighbors *= 0.5;
+        (done, judgement) = attempt(args, &engine, &output, &photos, &names, &way)?;
     }
     if names.len() < MANY {
         judgement.warnings.push(format!("{} photos are few: {MANY} or more are placed more surely", names.len()));
     }
     finish(args, &names, &done, &judgement, output)
+}
+
+/// What differs between attempts.
+struct Way {
+    /// Photos on either side that are compared, as a share of all.
+    neighbors: f64,
+    /// Whether masks hide what is beside the object from the engine.
+    masked: bool,
 }
 
 /// Runs the engine on photos and the neighbors of each, and judges what it finds.
@@ -105,13 +121,13 @@ fn attempt(
     output: &OutputFolder,
     photos: &[Taken],
     names: &[String],
-    neighbors: f64,
+    way: &Way,
 ) -> Result<(Done, Judgement), CliError> {
     let work = tempfile::tempdir().map_err(CliError::failure)?;
     let masks = args.masks.as_deref().map(|from| masks_again(from, photos, &work.path().join("masks"))).transpose()?;
     let job = Job {
-        masks: masks.as_ref().map(|(folder, _)| folder.clone()),
-        ..job(work.path(), &output.path("images")?, photos, names, neighbors, args)?
+        masks: masks.as_ref().filter(|_| way.masked).map(|(folder, _)| folder.clone()),
+        ..job(work.path(), &output.path("images")?, photos, names, way.neighbors, args)?
     };
     let done = engine.run(&job, &output.path("poses.log")?)?;
     let mut judgement = Judgement::of_engine(names, &done);
