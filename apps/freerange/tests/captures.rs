@@ -61,10 +61,12 @@ fn place_and_units_of_a_scene_do_not_matter() {
     bowl(&at("near"), 1.0, [0.0; 3]);
     bowl(&at("far"), 1.0, place);
     bowl(&at("small"), 1e-3, [0.0; 3]);
+    bowl(&at("large"), 1e3, [0.0; 3]);
     let (near, _) = reconstructed(&at("near"), &at("near-out"), &[]);
     let (far, said) = reconstructed(&at("far"), &at("far-out"), &["--format", "colmap"]);
     let (small, _) = reconstructed(&at("small"), &at("small-out"), &[]);
-    for other in [&far, &small] {
+    let (large, _) = reconstructed(&at("large"), &at("large-out"), &[]);
+    for other in [&far, &small, &large] {
         assert!((psnr(other) - psnr(&near)).abs() < 0.5, "{} {}", psnr(other), psnr(&near));
     }
     // What was subtracted is written down and told.
@@ -82,7 +84,7 @@ fn place_and_units_of_a_scene_do_not_matter() {
             .contains(&format!("comment Origin: {} {} {}\n", origin[0], origin[1], origin[2]))
     );
     // Cameras of the scene's own coordinates see the result.
-    for name in ["near", "far", "small"] {
+    for name in ["near", "far", "small", "large"] {
         let file = at(&format!("{name}-out/gaussians.ply"));
         let (renders, cameras) = (at(&format!("{name}-renders")), at(name));
         let done = freerange(&[
@@ -99,7 +101,7 @@ fn place_and_units_of_a_scene_do_not_matter() {
     pictures.retain(|p| p.extension().is_some_and(|e| e == "png"));
     assert_eq!(pictures.len(), 4);
     for picture in &pictures {
-        for other in ["far", "small"] {
+        for other in ["far", "small", "large"] {
             let off = differ(picture, &at(&format!("{other}-renders")).join(picture.file_name().unwrap()));
             assert!(off < 1.0, "{other}: {off}");
         }
@@ -149,7 +151,8 @@ fn ring(count: usize) -> Vec<View> {
         .collect()
 }
 
-/// Runs `poses` with an engine that finds these cameras, of photos in `folder`.
+/// Runs `poses` with an engine that finds these cameras, of photos in `folder`. `models`: photos in each; before a bar those that it finds
+/// under masks.
 #[cfg(unix)]
 fn posed(folder: &Path, views: &[View], found: &[View], models: &str, more: &[&str]) -> (i32, String, Option<Value>) {
     use std::os::unix::fs::PermissionsExt;
@@ -162,9 +165,11 @@ fn posed(folder: &Path, views: &[View], found: &[View], models: &str, more: &[&s
     let point = [(DVec3::ZERO, [0; 3])];
     freerange_scene::write_colmap(&model, found, DVec3::ZERO, &point).unwrap();
     let engine = folder.join("python");
+    let (masked, models) = models.split_once('|').unwrap_or((models, models));
     let script = format!(
-        "#!/bin/sh\nif [ \"$1\" = -c ]; then echo 0.0-test; exit 0; fi\nwork=$(dirname \"$2\")\nmkdir -p \"$work/model\"\n\
-         cp {}/sparse/0/*.bin \"$work/model/\"\necho '{{\"engine\": \"test\", \"models\": {models}, \"pairs\": \"neighbors\", \"points\": 1}}' \
+        "#!/bin/sh\nif [ \"$1\" = -c ]; then echo 0.0-test; exit 0; fi\nwork=$(dirname \"$2\")\nm='{models}'\n\
+         grep -q '\"masks\": null' \"$2\" || m='{masked}'\nmkdir -p \"$work/model\"\n\
+         cp {}/sparse/0/*.bin \"$work/model/\"\necho '{{\"engine\": \"test\", \"models\": '\"$m\"', \"pairs\": \"neighbors\", \"points\": 1}}' \
          > \"$work/result.json\"\n",
         model.display()
     );
@@ -186,13 +191,36 @@ fn poses_that_an_engine_finds_are_judged() {
     let views = ring(16);
     let at = |name: &str| folder.path().join("out").join(name);
     // Right ones: a scene.
-    let (code, said, json) = posed(folder.path(), &views, &views, "[16]", &[]);
-    assert_eq!(code, 0, "{said}");
+    let (code, said, json) = posed(folder.path(), &views, &views, "[16, 3]", &[]);
+    assert!(code == 0 && !said.contains("fit together"), "{said}");
     assert!(at("sparse/0/images.bin").is_file() && at("images/03.png").is_file());
     let json = json.unwrap();
     assert_eq!(json["judgement"]["refused"].as_array().unwrap().len(), 0);
     assert!((json["judgement"]["turns"][0].as_f64().unwrap() - 22.0).abs() < 3.0, "{json}");
     assert_eq!(freerange_scene::read::cameras(&folder.path().join("out"), None, None).unwrap().photos.len(), 16);
+    // Masks of all photos are part of it; masks of some are not, which is said.
+    let masks = folder.path().join("given");
+    fs::create_dir(&masks).unwrap();
+    for view in &views {
+        let mask = |x: u32, y: u32| image::Luma([if *view.image.get_pixel(x, y) == Rgba([0; 4]) { 0 } else { 255 }]);
+        let (w, h) = view.image.dimensions();
+        image::GrayImage::from_fn(w, h, mask).save(masks.join(format!("{}.png", view.name))).unwrap();
+    }
+    let given = ["--masks", masks.to_str().unwrap()];
+    let (code, said, _) = posed(folder.path(), &views, &views, "[16]", &given);
+    assert_eq!(code, 0, "{said}");
+    assert!(at("masks/15.png.png").is_file());
+    let found = freerange_scene::read::cameras(&folder.path().join("out"), None, None).unwrap();
+    let loaded = freerange_scene::load(&found, &freerange_scene::LoadConfig::default()).unwrap();
+    assert_eq!(loaded.masks, freerange_scene::MaskKind::Files);
+    // Where too little is found under them, what is beside them is looked at, too.
+    let (code, said, _) = posed(folder.path(), &views, &views, "[2]|[16]", &given);
+    assert!(code == 0 && said.contains("trying again with features beside the masks"), "{said}");
+    assert!(at("masks/15.png.png").is_file());
+    fs::remove_file(masks.join("03.png")).unwrap();
+    let (code, said, _) = posed(folder.path(), &views, &views, "[16]", &given);
+    assert!(code == 0 && said.contains("15 of 16 photos have a mask"), "{said}");
+    assert!(!at("masks").exists());
     // Some a third of a turn off, as where a pattern repeats: no scene, and where it begins is named.
     let mut wrong = views.clone();
     let turn = DMat4::from_rotation_z(std::f64::consts::TAU / 3.0);
@@ -206,8 +234,8 @@ fn poses_that_an_engine_finds_are_judged() {
     let (code, said, _) = posed(folder.path(), &views, &views[..11], "[11, 3]", &[]);
     assert_eq!(code, 2);
     assert!(said.contains("only 11 of 16 photos could be placed"), "{said}");
-    let (code, said, _) = posed(folder.path(), &views, &views[..14], "[14]", &[]);
-    assert_eq!(code, 0, "{said}");
+    let (code, said, _) = posed(folder.path(), &views, &views[..14], "[14, 2]", &[]);
+    assert!(code == 0 && said.contains("2 photos fit together by themselves"), "{said}");
     assert!(said.contains("no pose was found for 14.png, 15.png"), "{said}");
     // A focal length of no lens; photos too far apart.
     let mut wrong = views.clone();
@@ -242,6 +270,13 @@ fn poses_need_photos_and_an_engine() {
     }
     let text = said(&["poses", path, "-o", out, "--python", "/nowhere/python"]);
     assert!(text.contains("/nowhere/python") && text.contains("pycolmap"), "{text}");
+    // No engine at all: how to install one.
+    let done =
+        Command::new(env!("CARGO_BIN_EXE_freerange")).args(["poses", path, "-o", out]).env("PATH", path).output();
+    let done = done.unwrap();
+    let text = String::from_utf8_lossy(&done.stderr);
+    assert!(done.status.code() == Some(2) && text.contains("expected COLMAP on the PATH, or pycolmap"), "{text}");
+    assert!(text.contains("pip install pycolmap") && text.contains("apt install colmap"), "{text}");
     // `reconstruct` says what to do with photos alone.
     assert!(said(&["reconstruct", path, "-o", out]).contains("freerange poses"));
 }

@@ -249,6 +249,35 @@ fn messages_use_the_words_of_the_field() {
     assert!(wrong.is_empty(), "words that this project no longer uses:\n{}", wrong.join("\n"));
 }
 
+/// Tables of inputs name the test of each row in their last column.
+#[test]
+fn tests_that_the_inputs_page_names_exist() {
+    let text = fs::read_to_string(root().join("docs/reference/inputs.md")).unwrap();
+    let mut tests = BTreeSet::new();
+    for source in files(&["rs"]) {
+        let mut lines = source.text.lines().peekable();
+        while let Some(line) = lines.next() {
+            let name = lines.peek().and_then(|l| l.trim().strip_prefix("fn ")?.split('(').next());
+            tests.extend(name.filter(|_| line.trim() == "#[test]").map(str::to_owned));
+        }
+    }
+    let (mut in_table, mut found) = (false, 0);
+    for line in text.lines() {
+        let cells: Vec<&str> = line.split('|').map(str::trim).collect();
+        if !line.starts_with('|') {
+            in_table = false;
+        } else if cells[cells.len() - 2] == "test" {
+            in_table = true;
+        } else if in_table && !line.starts_with("|-") {
+            let name = cells[cells.len() - 2];
+            let known = name == "the same" || tests.contains(name.trim_matches('`'));
+            assert!(known, "inputs.md: a test that does not exist in {line}");
+            found += 1;
+        }
+    }
+    assert!(found >= 30, "{found}");
+}
+
 #[test]
 fn the_reference_of_the_configuration_is_current() {
     pages::check_generated("docs/reference/config.md", &config::page());

@@ -291,20 +291,23 @@ fn realitycapture(frames: &[(&str, Camera)], px: [f64; 2]) -> String {
 
 #[test]
 fn realitycapture_keeps_stored_pixels_and_its_principal_point() {
-    // The pixels are the camera's own, whatever the file says of turning it; a point off the middle by 5 % of the longer side.
-    for orientation in [1, 3, 6] {
+    // The pixels are the camera's own, whatever the file says of turning it; points off the middle
+    // by parts of the longer side.
+    for (orientation, x, y) in [(1, 0.05, -0.04), (3, -0.07, 0.02), (6, 0.0, 0.06)] {
         let capture = Capture::new();
         let mut frames = ring();
         for (name, c) in &mut frames {
-            (c.cx, c.cy) = (c.cx + 0.05 * f64::from(W), c.cy - 0.04 * f64::from(W));
+            (c.cx, c.cy) = (c.cx + x * f64::from(W), c.cy + y * f64::from(W));
             jpeg(&shot(c, |_, _| WHITE), orientation, &capture.at(&name.replace("png", "jpg")));
         }
         let named: Vec<(&str, Camera)> =
             ["a.jpg", "b.jpg", "c.jpg", "d.jpg"].into_iter().zip(frames).map(|(n, f)| (n, f.1)).collect();
-        std::fs::write(capture.at("cameras.csv"), realitycapture(&named, [0.05, -0.04])).unwrap();
+        std::fs::write(capture.at("cameras.csv"), realitycapture(&named, [x, y])).unwrap();
         let loaded = capture.load().unwrap();
         assert_right(&loaded, 4);
-        assert!((loaded.views[0].camera.cx - (0.5 + 0.05) * f64::from(W)).abs() < 1e-9);
+        let c = loaded.views[0].camera;
+        assert!((c.cx - (0.5 + x) * f64::from(W)).abs() < 1e-9);
+        assert!((c.cy - 0.5 * f64::from(H) - y * f64::from(W)).abs() < 1e-9);
     }
 }
 
@@ -397,7 +400,15 @@ fn photos_are_found_under_other_spellings_and_may_be_missing() {
 
 #[test]
 fn photos_that_are_not_read_are_named_with_what_to_do() {
-    for (file, kind) in [("a.HEIC", "HEIC"), ("a.avif", "AVIF"), ("a.tif", "TIFF"), ("a.exr", "OpenEXR")] {
+    for (file, kind) in [
+        ("a.HEIC", "HEIC"),
+        ("a.avif", "AVIF"),
+        ("a.tif", "TIFF"),
+        ("a.exr", "OpenEXR"),
+        ("a.jxl", "JPEG XL"),
+        ("a.dng", "raw"),
+        ("a.CR2", "raw"),
+    ] {
         let capture = Capture::new();
         for (name, c) in &ring()[1..] {
             shot(c, |_, _| WHITE).save(capture.at(name)).unwrap();

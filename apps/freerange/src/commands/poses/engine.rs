@@ -36,7 +36,8 @@ impl Engine {
         let found = colmap(Path::new("colmap")).or_else(|| pycolmap(Path::new("python3")));
         found.ok_or_else(|| {
             CliError::input(
-                "expected COLMAP on the PATH, or pycolmap in python3 (pip install pycolmap) or in --python PYTHON, found neither",
+                "expected COLMAP on the PATH, or pycolmap in python3 or in --python PYTHON, found neither: \
+                 `pip install pycolmap`, `apt install colmap` or `brew install colmap`",
             )
         })
     }

@@ -15,7 +15,7 @@ pub struct Job {
     pub images: PathBuf,
     /// The photos, in the order in which they were taken.
     pub names: Vec<String>,
-    /// Those of one size, which share a camera.
+    /// Those of one size and lens, which share a camera.
     pub groups: Vec<Vec<String>>,
     /// A file with a pair of names on each line: photos taken one after the other.
     pub pairs: PathBuf,

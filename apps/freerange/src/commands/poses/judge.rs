@@ -3,7 +3,11 @@
 
 use freerange::{choose_views, internal::leave_one_out, to_canonical};
 use freerange_scene::camera::{Camera, Lens, cameras_up, nearest_point};
-use freerange_scene::{LoadConfig, Loaded, Scene, SceneConfig, SceneError, inspect::view_warnings, read::Cameras};
+use freerange_scene::{
+    LoadConfig, Loaded, Scene, SceneConfig, SceneError,
+    inspect::view_warnings,
+    read::{Cameras, Intrinsics},
+};
 use glam::{DMat3, DVec3};
 use serde::Serialize;
 
@@ -20,6 +24,8 @@ const FAR_APART: f64 = 40.0;
 /// Focal length over the photo's longer side that lenses have, and the largest distortion.
 const FOCAL: std::ops::RangeInclusive<f64> = 0.4..=6.0;
 const MOST_DISTORTION: f64 = 0.5;
+/// Largest factor between a found focal length and EXIF's: right models are within 1.14.
+const MOST_ZOOM: f64 = 1.3;
 /// How much worse than the median photo one may be predicted from the others, in dB.
 const MOST_SURPRISE: f64 = 8.0;
 
@@ -54,7 +60,8 @@ impl Judgement {
             found.refused.push(format!("only {count} of {all} photos could be placed"));
         } else if done.points == 0 {
             found.refused.push("no points of the object were found".into());
-        } else if let Some(more) = done.models.get(1) {
+        } else if let Some(more) = done.models.get(1).filter(|_| count < all) {
+            // Where the first model has all photos, another has some of them again.
             found.warnings.push(format!("{more} photos fit together by themselves, but not with the others"));
         }
         found
@@ -67,7 +74,7 @@ impl Judgement {
             .enumerate()
             .filter_map(|(i, name)| {
                 let photo = cameras.photos.iter().find(|p| p.name == *name)?;
-                let freerange_scene::read::Intrinsics::Pixels(camera) = photo.intrinsics else { return None };
+                let Intrinsics::Pixels(camera) = photo.intrinsics else { return None };
                 Some((i, name.as_str(), camera, photo.lens))
             })
             .collect();
@@ -100,6 +107,22 @@ impl Judgement {
                 self.refused.push(format!(
                     "the focal length that was found, {focal:.2} of the photo's longer side, or its distortion is that of no usual lens"
                 ));
+            }
+        }
+    }
+
+    /// Compares focal lengths over the longer side, where EXIF data has one, with those found.
+    pub fn compare_lenses(&mut self, cameras: &Cameras, told: impl Iterator<Item = (String, Option<f64>)>) {
+        for (name, focal) in told.filter_map(|(name, focal)| Some((name, focal?))) {
+            let Some(photo) = cameras.photos.iter().find(|p| p.name == name) else { continue };
+            let Intrinsics::Pixels(camera) = photo.intrinsics else { continue };
+            let found = camera.fx / f64::from(camera.width.max(camera.height));
+            if !(1.0 / MOST_ZOOM..MOST_ZOOM).contains(&(found / focal)) {
+                self.warnings.push(format!(
+                    "the focal length that was found is {found:.2} of the longer side of {name}, \
+                     its EXIF data has {focal:.2}: poses may be wrong"
+                ));
+                return;
             }
         }
     }
@@ -213,5 +236,33 @@ impl Judgement {
         if !odd.is_empty() {
             self.warnings.push(format!("the other photos do not predict {}: its pose may be wrong", odd.join(", ")));
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use freerange::View;
+
+    #[test]
+    fn a_focal_length_far_from_exifs_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let image = image::RgbaImage::new(40, 30);
+        std::fs::create_dir(folder.path().join("images")).unwrap();
+        image.save(folder.path().join("images/a.png")).unwrap();
+        let mut camera = Camera::look_at(DVec3::Y, DVec3::ZERO, DVec3::Z, 1.0, 40, 30);
+        (camera.fx, camera.fy) = (40.0, 40.0);
+        let view = View { name: "a".into(), camera, image };
+        let points = [(DVec3::ZERO, [0; 3])];
+        freerange_scene::write_colmap(folder.path(), &[view], DVec3::ZERO, &points).unwrap();
+        let cameras = freerange_scene::read::cameras(folder.path(), None, None).unwrap();
+        let warnings = |focal: Option<f64>| {
+            let mut judgement = Judgement::default();
+            judgement.compare_lenses(&cameras, [("a.png".into(), focal)].into_iter());
+            judgement.warnings.concat()
+        };
+        assert_eq!([None, Some(0.88), Some(1.14)].map(warnings).concat(), "");
+        assert!(warnings(Some(0.7)).contains("1.00 of the longer side of a.png"));
+        assert!(warnings(Some(1.4)).contains("has 1.40"));
     }
 }

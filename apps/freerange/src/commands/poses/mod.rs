@@ -4,11 +4,9 @@ mod colmap;
 mod engine;
 mod job;
 mod judge;
+mod taken;
 
-use std::{
-    collections::BTreeMap,
-    path::{Path, PathBuf},
-};
+use std::path::{Path, PathBuf};
 
 use freerange_scene::read::{Format, cameras, in_order, photos_in};
 use serde::Serialize;
@@ -17,6 +15,7 @@ use crate::{error::CliError, output::OutputFolder};
 use engine::Engine;
 use job::{Done, Job};
 use judge::Judgement;
+use taken::{Taken, taken};
 
 /// How to photograph, for those whose photos could not be placed.
 const ADVICE: &str = "take 16 photos or more, 20 to 25 degrees apart, one way around the object, with a patterned cloth or newspaper below it";
@@ -27,7 +26,7 @@ const NEIGHBORS: f64 = 1.0 / 6.0;
 
 /// Find the cameras of photos that have none with COLMAP or pycolmap, and check them.
 ///
-/// The photos go once around the object, in the order of their names. Writes a scene for `reconstruct`: images/, sparse/0, poses.json
+/// The photos go once around the object, in the order of their EXIF times, else of their names. Writes a scene for `reconstruct`: images/, sparse/0, poses.json
 /// (poses and checks) and poses.log (output of COLMAP). Poses that look wrong are refused with exit code 2; poses.json and poses.log are
 /// still written.
 #[derive(clap::Args)]
@@ -43,7 +42,8 @@ pub struct Args {
     /// The photos are not at even steps: warn of uneven steps instead of refusing them.
     #[arg(long)]
     uneven: bool,
-    /// Folder of masks (NAME.jpg.png or NAME.png, black is ignored), for objects on a turntable.
+    /// Folder of masks (NAME.jpg.png or NAME.png, the object in white), for objects on a turntable. Those of all photos become part of the
+    /// scene.
     #[arg(long, value_name = "FOLDER")]
     masks: Option<PathBuf>,
     /// Seed of the engine's random numbers.
@@ -63,8 +63,9 @@ struct Report<'a> {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
-    let photos = photos_in(&args.photos)?;
-    let names: Vec<String> = in_order(&photos).iter().map(|p| plain_name(p)).collect();
+    let files = photos_in(&args.photos)?;
+    let (photos, timed) = taken(&files)?;
+    let names: Vec<String> = photos.iter().map(|p| plain_name(&p.path)).collect();
     if names.len() < 4 {
         return Err(CliError::input(format!(
             "{}: expected at least 4 photos, found {}; {ADVICE}",
@@ -74,19 +75,30 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     }
     let engine = Engine::find(args.python.as_deref())?;
     eprintln!("{} photos, {}", names.len(), engine.name());
+    if timed && !in_order(&files).iter().eq(photos.iter().map(|p| &p.path)) {
+        eprintln!("note: the photos are in the order of their EXIF times, not of their names");
+    }
     let output = OutputFolder::create("poses", &args.output)?;
-    for photo in &photos {
+    for photo in photos.iter().map(|photo| &photo.path) {
         let to = output.path(&format!("images/{}", plain_name(photo)))?;
         if to.exists() {
             return Err(CliError::file(photo, "expected a name that differs from the others by more than spaces"));
         }
         std::fs::copy(photo, to).map_err(|e| CliError::file(photo, e))?;
     }
-    let (mut done, mut judgement) = attempt(args, &engine, &output, &photos, &names, NEIGHBORS)?;
+    let mut way = Way { neighbors: NEIGHBORS, masked: args.masks.is_some() };
+    let (mut done, mut judgement) = attempt(args, &engine, &output, &photos, &names, &way)?;
+    if way.masked && !judgement.refused.is_empty() {
+        // The turntable itself has features, too. Those of a background that stands still are filtered.
+        eprintln!("note: {}; trying again with features beside the masks", judgement.refused.join("; "));
+        way.masked = false;
+        (done, judgement) = attempt(args, &engine, &output, &photos, &names, &way)?;
+    }
     if judgement.in_doubt {
         // Photos that look alike are farther apart than those that follow one another: fewer pairs mix up fewer.
         eprintln!("note: {}; trying again with fewer neighbors", judgement.refused.join("; "));
-        (done, judgement) = attempt(args, &engine, &output, &photos, &names, 0.5 * NEIGHBORS)?;
+        way.neighbors *= 0.5;
+        (done, judgement) = attempt(args, &engine, &output, &photos, &names, &way)?;
     }
     if names.len() < MANY {
         judgement.warnings.push(format!("{} photos are few: {MANY} or more are placed more surely", names.len()));
@@ -94,17 +106,29 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     finish(args, &names, &done, &judgement, output)
 }
 
+/// What differs between attempts.
+struct Way {
+    /// Photos on either side that are compared, as a share of all.
+    neighbors: f64,
+    /// Whether masks hide what is beside the object from the engine.
+    masked: bool,
+}
+
 /// Runs the engine on photos and the neighbors of each, and judges what it finds.
 fn attempt(
     args: &Args,
     engine: &Engine,
     output: &OutputFolder,
-    photos: &[PathBuf],
+    photos: &[Taken],
     names: &[String],
-    neighbors: f64,
+    way: &Way,
 ) -> Result<(Done, Judgement), CliError> {
     let work = tempfile::tempdir().map_err(CliError::failure)?;
-    let job = job(args, work.path(), &output.path("images")?, photos, names, neighbors)?;
+    let masks = args.masks.as_deref().map(|from| masks_again(from, photos, &work.path().join("masks"))).transpose()?;
+    let job = Job {
+        masks: masks.as_ref().filter(|_| way.masked).map(|(folder, _)| folder.clone()),
+        ..job(work.path(), &output.path("images")?, photos, names, way.neighbors, args)?
+    };
     let done = engine.run(&job, &output.path("poses.log")?)?;
     let mut judgement = Judgement::of_engine(names, &done);
     if judgement.refused.is_empty() {
@@ -112,8 +136,23 @@ fn attempt(
             let from = work.path().join("model").join(name);
             std::fs::copy(&from, output.path(&format!("sparse/0/{name}"))?).map_err(|e| CliError::file(&from, e))?;
         }
+        match &masks {
+            Some((folder, found)) if *found == photos.len() => {
+                for name in names {
+                    let from = folder.join(format!("{name}.png"));
+                    let to = output.path(&format!("masks/{name}.png"))?;
+                    std::fs::copy(&from, to).map_err(|e| CliError::file(&from, e))?;
+                }
+            }
+            Some((_, found)) => judgement.warnings.push(format!(
+                "{found} of {} photos have a mask: masks are used for poses only, not written to the scene",
+                photos.len()
+            )),
+            None => {}
+        }
         let found = cameras(&output.path("sparse/0/cameras.bin")?, Some(Format::Colmap), None)?;
         judgement.look(&found, names, args.uneven)?;
+        judgement.compare_lenses(&found, photos.iter().map(|p| (plain_name(&p.path), p.focal())));
         if judgement.refused.is_empty() {
             judgement.look_at_photos(&found)?;
         }
@@ -161,19 +200,15 @@ fn plain_name(photo: &Path) -> String {
 }
 
 fn job(
-    args: &Args,
     work: &Path,
     images: &Path,
-    photos: &[PathBuf],
+    photos: &[Taken],
     names: &[String],
     neighbors: f64,
+    args: &Args,
 ) -> Result<Job, CliError> {
-    // One camera for each size.
-    let mut sizes: BTreeMap<(u32, u32), Vec<String>> = BTreeMap::new();
-    for photo in in_order(photos) {
-        let size = image::image_dimensions(&photo).map_err(|e| CliError::file(&photo, e))?;
-        sizes.entry(size).or_default().push(plain_name(&photo));
-    }
+    let groups = taken::cameras(photos);
+    let names_of = |group: Vec<&Taken>| group.iter().map(|p| plain_name(&p.path)).collect();
     let pairs = work.join("pairs.txt");
     std::fs::write(&pairs, ring(names, neighbors)).map_err(|e| CliError::file(&pairs, e))?;
     let absolute = |p: &Path| std::fs::canonicalize(p).map_err(|e| CliError::file(p, e));
@@ -181,23 +216,24 @@ fn job(
         work: work.into(),
         images: absolute(images)?,
         names: names.to_vec(),
-        groups: sizes.into_values().collect(),
+        groups: groups.into_iter().map(names_of).collect(),
         pairs,
         thorough: names.len() < MANY || neighbors < NEIGHBORS,
         all_pairs: neighbors >= NEIGHBORS,
         peak_threshold: if args.masks.is_some() { 0.0066 } else { 0.002 },
-        masks: args.masks.as_deref().map(|from| masks_again(from, photos, &work.join("masks"))).transpose()?,
+        masks: None,
         seed: args.seed,
     })
 }
 
 /// Masks as COLMAP reads them without surprises: gray, black or white, of the photo's own size, one for each photo; white where there is none.
+/// Their folder, and for how many photos there was one.
 /// (It leaves photos without a mask out, and lays masks of another size on pixel for pixel.)
-fn masks_again(from: &Path, photos: &[PathBuf], to: &Path) -> Result<PathBuf, CliError> {
+fn masks_again(from: &Path, photos: &[Taken], to: &Path) -> Result<(PathBuf, usize), CliError> {
     std::fs::create_dir_all(to).map_err(|e| CliError::file(to, e))?;
     let mut found = 0;
     for photo in photos {
-        let size = image::image_dimensions(photo).map_err(|e| CliError::file(photo, e))?;
+        let (size, photo) = (photo.size, &photo.path);
         let stem = photo.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let whole = photo.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let names = [format!("{whole}.png"), format!("{stem}.png"), format!("{whole}.mask.png")];
@@ -220,7 +256,7 @@ fn masks_again(from: &Path, photos: &[PathBuf], to: &Path) -> Result<PathBuf, Cl
     }
     match found {
         0 => Err(CliError::file(from, "expected masks with the photos' names (NAME.jpg.png or NAME.png), found none")),
-        _ => Ok(to.into()),
+        _ => Ok((to.into(), found)),
     }
 }
 
@@ -250,10 +286,12 @@ mod tests {
         std::fs::create_dir(at("given")).unwrap();
         let photos: Vec<PathBuf> = ["a b.png", "c.png"].map(at).to_vec();
         photos.iter().for_each(|p| image::RgbImage::new(8, 6).save(p).unwrap());
+        let photos = taken(&photos).unwrap().0;
         assert!(masks_again(&at("given"), &photos, &at("none")).unwrap_err().to_string().contains("found none"));
         let label = image::GrayImage::from_fn(8, 6, |x, _| image::Luma([if x < 4 { 20 } else { 200 }]));
         label.save(at("given/a b.png")).unwrap();
-        let out = masks_again(&at("given"), &photos, &at("out")).unwrap();
+        let (out, found) = masks_again(&at("given"), &photos, &at("out")).unwrap();
+        assert_eq!(found, 1);
         let read = |name: &str| image::open(out.join(name)).unwrap().into_luma8();
         assert_eq!((read("a_b.png.png")[(0, 0)][0], read("a_b.png.png")[(7, 5)][0]), (0, 255));
         assert!(read("c.png.png").pixels().all(|p| p[0] == 255));
