@@ -1,10 +1,11 @@
 #!/usr/bin/env node
 // One object in every format, read by readers that are not ours, and shown by them and by our page beside `freerange render`.
 //
-//     cd tools/formats && npm ci && python3 -m venv venv && venv/bin/pip install 'gsply[sogs,spz]==0.4.6'
+//     tools/formats/run.sh target/release/freerange
 //     node --experimental-websocket check.mjs ../../target/release/freerange [FOLDER]
 //
-// Needs Chromium ($CHROMIUM, or `chromium` on the path). $PYTHON is the Python that has gsply; without it, gsply is left out, and said so.
+// Needs Chromium ($CHROMIUM, or `chromium` on the path), and what run.sh installs. $PYTHON is the Python that has gsply, gaussforge and
+// usd-core; without it they are left out, and said so.
 // Node 22 and later needs no option.
 import { execFileSync } from "node:child_process";
 import { existsSync, mkdirSync, mkdtempSync, readFileSync, writeFileSync } from "node:fs";
@@ -12,7 +13,8 @@ import { tmpdir } from "node:os";
 import { join, resolve } from "node:path";
 import validator from "gltf-validator";
 import { browser, serve } from "./browser.mjs";
-import { difference, fromCsv, object, toPly, turned } from "./object.mjs";
+import { covariance, difference, fromCsv, object, toPly, turned } from "./object.mjs";
+import { niantic, spzJs } from "./read_spz.mjs";
 
 const [, , command, given] = process.argv;
 const here = new URL(".", import.meta.url).pathname, folder = resolve(given ?? mkdtempSync(join(tmpdir(), "formats-")));
@@ -28,16 +30,17 @@ const file = (name) => join(folder, name);
 // The object, and its files.
 const gaussians = object(900), yUp = turned(gaussians, "x z -y");
 writeFileSync(file("object.ply"), toPly(gaussians));
-const FILES = ["written.ply", "object.splat", "object.spz", "object.sog", "object.glb", "view.html"];
-for (const name of FILES) run(command, "convert", file("object.ply"), file(name));
-run(command, "convert", file("object.ply"), file("version4.spz"), "--spz-version", "4");
-FILES.push("version4.spz");
+for (const name of ["written.ply", "object.splat", "object.spz", "object.sog", "object.glb", "object.usda", "object.usdz", "view.html"])
+  run(command, "convert", file("object.ply"), file(name));
+for (const version of ["2", "4"]) run(command, "convert", file("object.ply"), file(`version${version}.spz`), "--spz-version", version);
 
 // What formats may lose: centres, log-scales, radians, opacity, colour. Half a step each, and a little for others' arithmetic.
 const LOSS = {
   "written.ply": [1e-6, 1e-5, 1e-3, 1e-5, 1e-5],
   "object.splat": [1e-6, 1e-5, 0.03, 0.0025, 0.0025],
   "object.spz": [2e-6, 0.032, 0.006, 0.0025, 0.004],
+  // Of rotations w is left out, whatever its size: ten degrees.
+  "version2.spz": [2e-6, 0.032, 0.19, 0.0025, 0.004],
   "version4.spz": [2e-6, 0.032, 0.006, 0.0025, 0.004],
   "object.sog": [6e-6, 0.01, 0.017, 0.0025, 0.004],
 };
@@ -46,23 +49,53 @@ const compare = (reader, name, expected, found, loss = LOSS[name]) => {
   check(`${reader} reads ${name}`, ok, Object.entries(d).map(([k, v]) => `${k} ${v.toExponential(1)}`).join(", "));
 };
 
-// splat-transform: takes .spz to the frame with -y up that it expects of .ply: (x, -y, -z) of +y up.
+// Of readers that show nothing else: each center with the nearest.
+const centers = (reader, name, positions) => {
+  const all = Array.from({ length: positions.length / 3 }, (_, i) => positions.slice(3 * i, 3 * i + 3));
+  const far = (a, b) => Math.max(...a.map((v, k) => Math.abs(v - b[k])));
+  const apart = Math.max(...asWritten(name).map((g) => Math.min(...all.map((p) => far(p, g.mean)))));
+  check(`${reader} reads ${name}`, all.length === gaussians.length && apart <= LOSS[name][0], `centers ${apart.toExponential(1)}`);
+};
+
+// Readers take the numbers of .spz as they are, +y up.
+const asWritten = (name) => (name.endsWith(".spz") ? yUp : gaussians);
 const transform = join(here, "node_modules/@playcanvas/splat-transform/bin/cli.mjs");
 for (const name of Object.keys(LOSS)) {
   run("node", transform, "-q", "-w", file(name), file(`${name}.csv`));
-  const frame = name.endsWith(".spz") ? turned(yUp, "x -y -z") : gaussians;
-  compare("splat-transform", name, frame, fromCsv(file(`${name}.csv`)));
+  compare("splat-transform", name, asWritten(name), fromCsv(file(`${name}.csv`)));
 }
+for (const name of ["version2.spz", "object.spz", "version4.spz"]) compare("Niantic's library", name, yUp, await niantic(file(name)));
+compare("spz-js", "version2.spz", yUp, await spzJs(file("version2.spz")));
 
-// gsply: takes the numbers as they are.
 const python = process.env.PYTHON ?? join(here, "venv/bin/python");
 if (existsSync(python)) {
-  for (const name of Object.keys(LOSS).filter((n) => n !== "object.splat")) {
-    const found = JSON.parse(run(python, join(here, "read_gsply.py"), file(name)));
-    compare("gsply", name, name.endsWith(".spz") ? yUp : gaussians, found);
+  const read = (script, name) => JSON.parse(run(python, join(here, script), file(name)).trim().split("\n").at(-1));
+  for (const name of Object.keys(LOSS)) {
+    if (name !== "object.splat") compare("gsply", name, asWritten(name), read("read_gsply.py", name));
+    compare("gaussforge", name, asWritten(name), read("read_gaussforge.py", name));
   }
-} else if (process.env.CI === "true") check("gsply", false, `no ${python}`);
-else console.log(`left out: gsply (no ${python})`);
+  for (const name of ["object.usda", "object.usdz"]) usd(name, read("read_usd.py", name));
+} else if (process.env.CI === "true") check("Python's readers", false, `no ${python}`);
+else console.log(`left out: gsply, gaussforge, usd-core (no ${python})`);
+
+// OpenUSD: values of the stage, in its frame (+z up here), and the box that frames it, three deviations around.
+function usd(name, found) {
+  const most = (a, b) => Math.max(...a.flat().map((v, k) => Math.abs(v - b.flat()[k])));
+  const logistic = (v) => 1 / (1 + Math.exp(-v));
+  const apart = {
+    mean: most(gaussians.map((g) => g.mean), found.positions),
+    covariance: most(gaussians.map((g) => covariance(g)), found.covariances),
+    opacity: most(gaussians.map((g) => logistic(g.opacity)), found.opacities),
+    color: most(gaussians.map((g) => g.color), found.coefficients),
+  };
+  const same = found.up === "Z" && found.degree === 0 && found.elementSize === 1 && found.positions.length === gaussians.length;
+  const around = gaussians.every((g) => g.mean.every((v, k) => {
+    const reach = 3 * Math.sqrt(covariance(g)[4 * k]) - 1e-6;
+    return v - reach >= found.box[0][k] && v + reach <= found.box[1][k];
+  }));
+  const ok = same && around && apart.mean < 1e-6 && apart.covariance < 1e-8 && apart.opacity < 1e-6 && apart.color < 2e-6;
+  check(`usd-core reads ${name}`, ok, Object.entries(apart).map(([k, v]) => `${k} ${v.toExponential(1)}`).join(", "));
+}
 
 // The validator does not know the extension: one message per attribute of it, and no other.
 const report = await validator.validateBytes(new Uint8Array(readFileSync(file("object.glb"))));
@@ -167,13 +200,24 @@ try {
     shown(`${reader}, ${name}`, bytes(data), reader === "three" ? 25 : 30);
     if (reader === "three" && first) shown(`${reader}, ${name}`, bytes(data), 38, first, "its object.glb");
     first ??= bytes(data);
-    if (positions) {
-      const apart = Math.max(...yUp.flatMap((g, i) => g.mean.map((v, k) => Math.abs(v - positions[3 * i + k]))));
-      check(`${reader} reads ${name}`, apart <= LOSS[name][0], `centres ${apart.toExponential(1)}`);
-    }
+    if (positions) centers(reader, name, positions);
     // Spark itself keeps 16-bit floats, 8 bits of log-scale, opacity and colour, and of rotations two of an octahedron and one of the angle.
     const kept = [2e-4, 0.045, 0.035, 0.0025, 0.003];
-    if (found) compare(reader, name, inYUp ? yUp : gaussians, found, LOSS[name].map((v, k) => v + kept[k]));
+    if (found) compare(reader, name, asWritten(name), found, LOSS[name].map((v, k) => v + kept[k]));
+  }
+  // Without pictures, which take minutes.
+  for (const name of ["written.ply", "object.splat", "version2.spz"]) {
+    const positions = await chromium.evaluate(`threePositions("/files/${name}")`);
+    centers("three", name, positions);
+  }
+  for (const name of ["version2.spz", "object.spz"]) {
+    const found = await chromium.evaluate(`spzLoader("/files/${name}")`);
+    compare("spz-loader", name, yUp, found);
+  }
+  // It keeps 8 bits of opacity and color, cut instead of rounded.
+  for (const name of ["written.ply", "object.splat", "version2.spz"]) {
+    const found = await chromium.evaluate(`splats3d("/files/${name}")`), kept = [1e-6, 1e-5, 1e-3, 0.004, 0.004];
+    compare("gaussian-splats-3d", name, asWritten(name), found, LOSS[name].map((v, k) => v + kept[k]));
   }
 } finally {
   await chromium.close();

@@ -77,6 +77,16 @@ export function difference(expected, found) {
   return most;
 }
 
+// The covariance, row by row.
+export function covariance({ scale, rotation: [w, x, y, z] }) {
+  const turn = [
+    [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+    [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+    [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+  ];
+  return turn.flatMap((a) => turn.map((b) => scale.reduce((sum, s, k) => sum + a[k] * b[k] * Math.exp(2 * s), 0)));
+}
+
 // `gaussians` turned by a quarter or half turn: `axes` says for each new axis which old one it is, and with which sign, as in "x z -y".
 export function turned(gaussians, axes) {
   const rows = axes.split(" ").map((a) => [..."xyz"].map((name) => (a.at(-1) === name ? (a[0] === "-" ? -1 : 1) : 0)));

@@ -23,9 +23,9 @@ export CHROMIUM
 if [ ! -d node_modules ]; then
   npm ci --no-audit --no-fund --ignore-scripts || leave "no packages from npm"
 fi
-# Of the Python reader the check itself says that it is left out.
+# Of the Python readers the check itself says that they are left out.
 if [ -z "${PYTHON:-}" ] && [ ! -d venv ]; then
-  { python3 -m venv venv && venv/bin/pip install -q 'gsply[sogs,spz]==0.4.6'; } || rm -rf venv
+  { python3 -m venv venv && venv/bin/pip install -q 'gsply[sogs,spz]==0.4.6' gaussforge==0.6.0 plyfile==1.1.5 usd-core==26.11; } || rm -rf venv
 fi
 options=()
 node -e 'process.exit(typeof WebSocket === "undefined" ? 1 : 0)' || options+=(--experimental-websocket)

@@ -3,8 +3,9 @@
 //
 //     cd tools/formats && npm ci && node vectors.mjs ../../tests/golden/formats
 //
-// From one .ply with first-degree spherical harmonics, written here: compressed .ply, .sog, .spz 3 and 4 and .glb by splat-transform, .spz 2 by @adobe/spz
-// (the format's own C++ code).
+// From one .ply with first-degree spherical harmonics, written here: compressed .ply, .sog, .spz and .glb by splat-transform, .spz 2 by
+// @adobe/spz (the format's own C++ code). Those by splat-transform 2.7.1, which turned .spz to +y up, are kept: source.compressed.ply,
+// source.sog, source.glb, v3.spz, v4.spz. Python's writers: other_vectors.py and usd_vectors.py.
 import { execFileSync } from "node:child_process";
 import { mkdirSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
@@ -17,11 +18,8 @@ const gaussians = object(270, 9), source = join(folder, "source.ply");
 writeFileSync(source, toPly(gaussians));
 const command = new URL("node_modules/@playcanvas/splat-transform/bin/cli.mjs", import.meta.url).pathname;
 const convert = (name, ...options) => execFileSync("node", [command, "-q", "-w", ...options, source, join(folder, name)], { stdio: "inherit" });
-convert("source.compressed.ply");
-convert("source.sog", "-g", "cpu");
-convert("v3.spz", "--spz-version", "3");
-convert("v4.spz", "--spz-version", "4");
-convert("source.glb");
+for (const kind of ["compressed.ply", "sog", "glb"]) convert(`transform.${kind}`, "-g", "cpu");
+for (const version of ["3", "4"]) convert(`transform-v${version}.spz`, "--spz-version", version);
 
 const spz = await createSpz();
 const all = (f) => Float32Array.from(gaussians.flatMap(f));

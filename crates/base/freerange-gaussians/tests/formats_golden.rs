@@ -1,4 +1,5 @@
-//! Files by other programs' writers (tools/formats/vectors.mjs): the same Gaussians, within what each format can hold.
+//! Files by other programs' writers (`vectors.mjs` and its neighbors in tools/formats): the same Gaussians, within what
+//! each format can hold.
 
 mod common;
 
@@ -95,13 +96,15 @@ fn sog() {
 
 #[test]
 fn glb() {
-    let mut loaded = golden("source.glb", Frame::Y_UP);
-    assert!(loaded.notes.is_empty(), "{:?}", loaded.notes);
-    // The writer turns half about z.
-    loaded.splats.transform(1.0, DQuat::from_xyzw(0.0, 0.0, 1.0, 0.0), DVec3::ZERO);
-    let (source, found) = like_source(&loaded.splats);
-    difference(&source.cloud, &found.cloud).assert_within(1e-6, 1e-5, 1e-3, 1e-5, 1e-5);
-    assert_harmonics(&source, &found, 1e-5);
+    for name in ["source.glb", "transform.glb"] {
+        let mut loaded = golden(name, Frame::Y_UP);
+        assert!(loaded.notes.is_empty(), "{:?}", loaded.notes);
+        // The writer turns half about z.
+        loaded.splats.transform(1.0, DQuat::from_xyzw(0.0, 0.0, 1.0, 0.0), DVec3::ZERO);
+        let (source, found) = like_source(&loaded.splats);
+        difference(&source.cloud, &found.cloud).assert_within(1e-6, 1e-5, 1e-3, 1e-5, 1e-5);
+        assert_harmonics(&source, &found, 1e-5);
+    }
 }
 
 #[test]
@@ -120,4 +123,34 @@ fn usd_by_its_own_writer() {
     assert!(loaded.notes.is_empty() && loaded.splats.harmonics.degree() == 0, "{:?}", loaded.notes);
     let (source, found) = like_source(&loaded.splats);
     difference(&source.cloud, &found.cloud).assert_within(2e-4, 1e-3, 2e-3, 5e-4, 1e-3);
+}
+
+/// The newest writers of November 2026: splat-transform 3.7.0 (`transform`), gsply 0.4.6, gaussforge 0.6.0.
+#[test]
+fn newest_writers() {
+    // Position, log-scale, rotation in radians, opacity, color; harmonics, where the file has them exactly enough. All of
+    // them copy the numbers of the .ply into .spz.
+    let spz = (0.5 / 4096.0 + 1e-6, 1.0 / 32.0 + 1e-5, 0.005, HALF, 0.0037, Some(4.5 / 128.0 + 1e-6));
+    let chunks = (0.49 / 2046.0, 2.0 / 2046.0, 0.005, HALF, 1.5 * HALF, Some(0.5 * 8.0 / 256.0 + 1e-6));
+    for (name, frame, limits) in [
+        ("transform.compressed.ply", Frame::Z_UP, chunks),
+        // Some harmonics are wrong in the file: splat-transform reads the same.
+        ("gaussforge.compressed.ply", Frame::Z_UP, (chunks.0, chunks.1, chunks.2, chunks.3, chunks.4, None)),
+        ("transform-v3.spz", Frame::Y_UP, spz),
+        ("transform-v4.spz", Frame::Y_UP, spz),
+        ("gsply-v3.spz", Frame::Y_UP, spz),
+        ("gsply-v4.spz", Frame::Y_UP, spz),
+        ("gaussforge.spz", Frame::Y_UP, spz),
+        ("gaussforge.splat", Frame::Z_UP, (1e-6, 1e-5, 0.03, 2.0 * HALF, 2.0 * HALF, None)),
+        ("transform.sog", Frame::Z_UP, (1e-5, 0.01, 0.033, 2.0 * HALF, 0.005, None)),
+        ("gaussforge.sog", Frame::Z_UP, (1e-5, 0.01, 0.033, 2.0 * HALF, 0.005, None)),
+    ] {
+        let (position, scale, rotation, opacity, color, harmonics) = limits;
+        let (source, found) = like_source(&golden(name, frame).splats);
+        eprintln!("{name}"); // for a failure's sake
+        difference(&source.cloud, &found.cloud).assert_within(position, scale, rotation, opacity, color);
+        if let Some(limit) = harmonics {
+            assert_harmonics(&source, &found, limit);
+        }
+    }
 }
