@@ -4,6 +4,7 @@
 use freerange::{choose_views, internal::leave_one_out, to_canonical};
 use freerange_scene::camera::{Camera, Lens, cameras_up, nearest_point};
 use freerange_scene::{LoadConfig, Loaded, Scene, SceneConfig, SceneError, inspect::view_warnings, read::Cameras};
+use freerange_util::Stop;
 use glam::{DMat3, DVec3};
 use serde::Serialize;
 
@@ -188,7 +189,7 @@ impl Judgement {
     }
 
     fn predict(&mut self, loaded: &Loaded) {
-        let shown = match leave_one_out(&loaded.views) {
+        let shown = match leave_one_out(&loaded.views, &Stop::default()) {
             Ok(shown) => shown,
             Err(e) => {
                 self.refused.push(format!("no picture of the object comes of these poses ({e})"));
