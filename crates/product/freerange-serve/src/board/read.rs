@@ -7,6 +7,7 @@ use std::{
 };
 
 use freerange_util::Stop;
+use rayon::ThreadPoolBuilder;
 use serde_json::Value;
 
 use super::{
@@ -52,8 +53,15 @@ impl Board {
 
     /// Reads photos, one job after the other, until the server ends. Several threads do so at the same time.
     pub fn read_all(&self) {
+        // Threads of its own: in a common pool, pictures of a small job would wait behind all those of a large one.
+        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        let own = ThreadPoolBuilder::new().num_threads(cores.div_ceil(self.limits.readers.max(1))).build();
+        let pool = match own {
+            Ok(pool) => pool,
+            Err(e) => return tracing::error!("no threads to read photos: {e}"),
+        };
         while let Some(unread) = self.next_unread() {
-            let read = guarded(|| self.read(&unread));
+            let read = pool.install(|| guarded(|| self.read(&unread)));
             let Unread { id, folder, cancel, .. } = unread;
             clear(&uploads(&folder));
             let bytes = size_of(&folder);

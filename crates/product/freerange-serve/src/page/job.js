@@ -14,7 +14,7 @@ import { app } from "./state.js";
 /** What is done after a mask was edited. */
 export const hooks = { edited: async () => {} };
 
-const WORDS = { canonicalize: "finding the object", symmetry: "app.looking for symmetry", propose: "proposing", refine: "refining with the network", optimize: "optimizing on the photos" };
+const WORDS = { canonicalize: "finding the object", symmetry: "looking for symmetry", propose: "proposing", refine: "refining with the network", optimize: "optimizing on the photos" };
 
 /** @param {Status} s */
 const sentence = (s) => {
