@@ -1,7 +1,7 @@
 # freerange in a container: `docker build -t freerange .`, for NVIDIA cards `docker build -t freerange:cuda --build-arg VARIANT=cuda .`
 #
 #     docker run --rm -v "$PWD:/work" -u "$(id -u)" freerange reconstruct SCENE -o out
-#     docker run --rm -p 127.0.0.1:7878:7878 freerange serve --host 0.0.0.0 --token SECRET      # 16 characters or more; http://127.0.0.1:7878/?token=SECRET
+#     docker run --rm -p 127.0.0.1:7878:7878 freerange serve --host 0.0.0.0      # prints a link with a token; open it at 127.0.0.1
 #     docker run --rm --gpus all freerange:cuda devices
 #
 # Arguments: VARIANT, cpu or cuda; FEATURES, further Cargo features, as in FEATURES=fetch,cloud.

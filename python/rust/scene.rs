@@ -59,6 +59,7 @@ pub fn read_scene(py: Python<'_>, path: PathBuf, photos: Photos, up: RawUp) -> P
         invert_masks: photos.invert_masks,
         max_side: photos.max_side,
         hints: Hints { center, radius: photos.radius, others: None },
+        ..LoadConfig::default()
     };
     let up = up.read(true)?;
     py.detach(|| {

@@ -22,7 +22,7 @@ const check = (name, ok, found) => {
 const told = (name, found) => console.log(`        ${name}: ${found}`);
 const wait = (ms) => new Promise((done) => setTimeout(done, ms));
 
-/** Starts the program; resolves when it has told its address. Few steps from noise: the page is checked, not the samples. */
+/** Starts the program; resolves when it has told its address, with the token that it has drawn. Few steps from noise: the page is checked, not the samples. */
 const start = () => new Promise((done, fail) => {
   const program = spawn(command, ["serve", "--port", "0", "--keep", keep, "--device", "cpu", "--set", "propose.flow.steps=8"], { stdio: ["ignore", "pipe", "inherit"] });
   let text = "";
@@ -30,8 +30,8 @@ const start = () => new Promise((done, fail) => {
   program.on("exit", (code, signal) => fail(new Error(`freerange serve ended: ${code ?? signal}`)));
   program.stdout.on("data", (chunk) => {
     text += chunk;
-    const found = /^(http:\/\/\S+)\/\n/.exec(text);
-    if (found) done({ program, url: found[1] });
+    const found = /^(http:\/\/\S+)\/\?token=(\S+)\n/.exec(text);
+    if (found) done({ program, url: found[1], token: found[2] });
   });
 });
 const ended = (program) => new Promise((done) => {
@@ -39,9 +39,9 @@ const ended = (program) => new Promise((done) => {
   program.once("exit", (code, signal) => done(code ?? signal));
 });
 
-let { program, url } = await start();
+let { program, url, token } = await start();
 const get = async (path) => {
-  const response = await fetch(url + path);
+  const response = await fetch(url + path, { headers: { Authorization: `Bearer ${token}` } });
   if (!response.ok) throw new Error(`${path}: ${response.status}`);
   return Buffer.from(await response.arrayBuffer());
 };
@@ -79,10 +79,36 @@ const SUM = "window.viewers[0].rows.reduce((sum, v, i) => sum + v * ((i % 97) + 
 try {
   await send("Emulation.setEmulatedMedia", { features: [{ name: "prefers-color-scheme", value: "light" }] });
   let bytes = 0;
-  for (const path of ["/", "/style.css", "/viewer.js", "/page.js"]) bytes += (await get(path)).length;
-  check("size of the page", bytes < 100_000, `${bytes} bytes`);
+  const modules = ["main", "jobs", "job", "gaussians", "panes", "brush", "edit", "send", "record", "dom", "state"].map((name) => `/${name}.js`);
+  for (const path of ["/", "/style.css", "/viewer.js", ...modules]) bytes += (await get(path)).length;
+  check("size of the page", bytes < 120_000, `${bytes} bytes`);
+
+  // Who does not know the token is asked for it; a wrong one is told; a link of another site with the right one leads to the page.
   await chromium.open(url);
-  await until("document.getElementById('engine').textContent");
+  await until("document.querySelector('form')?.action.startsWith('http')");
+  await accessible("login");
+  await picture("login");
+  await evaluate("document.getElementById('token').value = 'wrong-wrong-wrong-wrong'; document.querySelector('form').submit()");
+  await until("document.getElementById('alert')?.textContent.includes('not the token')");
+  await accessible("login, wrong token");
+  check("a wrong token", true, await evaluate("document.getElementById('alert').textContent"));
+  const linked = join(folder, "link");
+  mkdirSync(linked);
+  writeFileSync(join(linked, "index.html"), `<a id="link" href="${url}/?token=${token}">free-range</a>`);
+  const other = await serve({ link: linked });
+  await chromium.open(`${other.url.replace("127.0.0.1", "localhost")}/link/index.html`);
+  await evaluate("document.getElementById('link').click()");
+  await until("document.getElementById('engine')?.textContent");
+  check("a link of another site", await evaluate("location.pathname + location.search") === "/", await evaluate("location.href"));
+  // Followed again without the token: the cookie is there, though the browser holds it back at first.
+  writeFileSync(join(linked, "index.html"), `<a id="link" href="${url}/">free-range</a>`);
+  await chromium.open(`${other.url.replace("127.0.0.1", "localhost")}/link/index.html`);
+  await evaluate("document.getElementById('link').click()");
+  await until("document.getElementById('engine')?.textContent");
+  check("a link of another site without the token", true, await evaluate("location.href"));
+  other.close();
+
+  check("limits before anything is sent", await evaluate("document.getElementById('limits').textContent.includes('512 MB')"), await evaluate("document.getElementById('limits').textContent"));
   await accessible("at the start");
   await picture("start");
 
@@ -113,8 +139,37 @@ try {
   await click("#paint-add");
   await drag("#paint", 12, 6);
   await click("#paint-save");
-  await until("document.querySelector('#photos li:nth-child(2)').textContent.includes("edited")");
-  check("a edited mask", true, await evaluate("document.querySelector('#photos li:nth-child(2) .small').textContent"));
+  await until("document.querySelector('#photos li:nth-child(2)').textContent.includes('edited')");
+  check("an edited mask", true, await evaluate("document.querySelector('#photos li:nth-child(2) .small').textContent"));
+
+  // A row of buttons is one stop of the Tab key.
+  await evaluate("document.querySelector('#tools button').focus()");
+  await key("ArrowRight", 39);
+  await key("End", 35);
+  check("a toolbar by keys", await evaluate("document.activeElement.id") === "background", await evaluate("[...document.querySelectorAll('#tools button')].map((b) => b.tabIndex).join(' ')"));
+  await click("#background");
+  check("background has a state", await evaluate("document.getElementById('background').getAttribute('aria-pressed')") === "true", "pressed");
+  await click("#background");
+
+  // A title of one's own; removed, and had back.
+  const idOf = () => evaluate("location.hash.slice(5)");
+  await click("#rename");
+  await accessible("rename");
+  await evaluate("document.getElementById('new-title').value = 'a <b>bowl</b>'; document.querySelector('#rename-form button').click()");
+  await until("document.getElementById('job-title').textContent === 'a <b>bowl</b>'");
+  const mine = await idOf();
+  await click("#remove");
+  await until("document.getElementById('remove-dialog').open");
+  check("remove asks", await evaluate("document.activeElement.id") === "remove-no", await evaluate("document.getElementById('remove-title').textContent"));
+  await accessible("remove");
+  await picture("remove");
+  await click("#remove-yes");
+  await until("document.activeElement.id === 'undo' && document.getElementById('job').hidden");
+  check("focus after removal", true, "on Undo");
+  await accessible("after removal");
+  await click("#undo");
+  await until(`location.hash === '#job=${mine}' && document.getElementById('job-title').textContent === 'a <b>bowl</b>' && document.body.dataset.state === 'ready'`);
+  check("undo", true, await evaluate("document.getElementById('status').textContent"));
 
   // Go; orbit while it computes; cancel.
   const go = async () => {
@@ -152,6 +207,43 @@ try {
   await until(`document.body.dataset.result === ${JSON.stringify(id)}`);
   await picture("done");
   await accessible("with a result");
+
+  // A turntable as the browser records it; and the object turns by itself.
+  await evaluate("window.saved = []; HTMLAnchorElement.prototype.click = function () { window.saved.push(this.download); }");
+  await click("#film");
+  await until("Number(document.body.dataset.film) > 1000 && window.saved.length === 1", 60);
+  check("turntable", true, `${await evaluate("window.saved[0]")}, ${await evaluate("document.body.dataset.film")} bytes`);
+  await click("#shot");
+  await until("window.saved.length === 2");
+  check("a picture", (await evaluate("window.saved[1]")).endsWith("-0.png"), await evaluate("window.saved[1]"));
+  await evaluate("delete HTMLAnchorElement.prototype.click");
+  await click("#auto");
+  const turned = await evaluate("window.viewers[0].orbit.azimuth");
+  await until(`window.viewers[0].orbit.azimuth > ${turned} + 0.02`);
+  await click("#auto");
+  check("turns by itself", await evaluate("document.getElementById('auto').getAttribute('aria-pressed')") === "false", "and stops");
+
+  // Cropped, tidied, and had back.
+  await evaluate("document.getElementById('edit').open = true");
+  await until("document.getElementById('edit-text').textContent.includes(' of ')");
+  const all = await evaluate("window.viewers[0].count");
+  await evaluate("(() => { const to = document.getElementById('to-2'); to.value = 50; to.dispatchEvent(new Event('input')); })()");
+  const half = await evaluate("window.viewers[0].count");
+  await accessible("with a box");
+  await picture("crop");
+  await click("#edit-crop");
+  await until("!document.getElementById('edit-undo').disabled");
+  const [header] = (await get(`/jobs/${id}/samples/0.ply`)).toString("latin1").split("end_header");
+  check("crop", half < all && header.includes(`element vertex ${half}\n`), `${half} of ${all}, in the file as well`);
+  await click("#edit-undo");
+  await until(`window.viewers[0].count === ${all} && document.getElementById('edit-undo').disabled`);
+  await click("#edit-tidy");
+  await until("!document.getElementById('edit-undo').disabled");
+  told("floaters", `${all - await evaluate("window.viewers[0].count")} Gaussians`);
+  await click("#edit-undo");
+  await until(`window.viewers[0].count === ${all} && document.getElementById('edit-undo').disabled`);
+  check("undo of an edit", true, await evaluate("document.getElementById('edit-text').textContent"));
+  await evaluate("document.getElementById('edit').open = false");
 
   // Through a photo's camera, and the slider between the two.
   await click("#photos li:nth-child(1) .look");
@@ -258,8 +350,8 @@ try {
   const gone = ended(program);
   program.kill("SIGKILL");
   await gone;
-  ({ program, url } = await start());
-  await chromium.open(`${url}/#job=${id}`);
+  ({ program, url, token } = await start());
+  await chromium.open(`${url}/?token=${token}#job=${id}`);
   await state("interrupted", 30);
   check("kill -9 and start again", true, await evaluate("document.getElementById('status').textContent"));
   await picture("interrupted");

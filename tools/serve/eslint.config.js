@@ -7,17 +7,18 @@ export default [
   {
     files: ["**/*.js"],
     languageOptions: {
-      sourceType: "script",
-      globals: names("window document location fetch EventSource FormData File OffscreenCanvas HTMLElement "
-        + "HTMLButtonElement HTMLInputElement HTMLSelectElement HTMLProgressElement HTMLCanvasElement HTMLFormElement HTMLAnchorElement HTMLDialogElement "
+      sourceType: "module",
+      globals: names("window document location history navigator fetch URL Blob Event EventTarget EventSource XMLHttpRequest MediaRecorder FormData File OffscreenCanvas HTMLElement "
+        + "HTMLButtonElement HTMLInputElement HTMLSelectElement HTMLProgressElement HTMLCanvasElement HTMLFormElement HTMLAnchorElement HTMLDialogElement HTMLDetailsElement "
         + "createImageBitmap setTimeout clearTimeout requestAnimationFrame cancelAnimationFrame ResizeObserver getComputedStyle performance URLSearchParams atob Viewer BUDGET"),
     },
     rules: { eqeqeq: "error", "no-implicit-globals": "off", "no-var": "error", "prefer-const": "error", "no-eval": "error", "no-unused-vars": ["error", { varsIgnorePattern: "^Viewer$" }] },
   },
-  { files: ["**/*.mjs"], languageOptions: { globals: names("process URL console setTimeout fetch Buffer") } },
+  { files: ["**/*.mjs"], languageOptions: { globals: names("process URL console setTimeout fetch Buffer WebSocket") } },
   {
     // The viewer defines what the page uses.
-    files: ["**/viewer.js"],
+    files: ["**/viewer.js", "**/enter.js"],
+    languageOptions: { sourceType: "script" },
     rules: { "no-redeclare": "off" },
   },
 ];

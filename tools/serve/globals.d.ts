@@ -1,4 +1,4 @@
-// What the page's two scripts share. The viewer's is a script of its own, shown here as the page sees it.
+// What the page's modules have of the viewer. The viewer's is a script of its own, shown here as the page sees it.
 interface Pinhole { width: number; height: number; fx: number; fy: number; cx: number; cy: number; world_to_camera: number[] }
 interface Orbit { target: number[]; azimuth: number; elevation: number; distance: number; fov: number }
 declare const BUDGET: number;
@@ -25,5 +25,6 @@ declare class Viewer {
   redraw(): void;
   draw(): void;
   do(name: string): void;
+  turn(azimuth: number, elevation: number): void;
 }
 interface Window { viewers?: Viewer[] }

@@ -149,6 +149,7 @@ impl Photos {
             invert_masks: self.invert_masks,
             max_side: self.max_resolution,
             hints: Hints { center: self.center, radius: self.radius, others: None },
+            ..LoadConfig::default()
         }
     }
 

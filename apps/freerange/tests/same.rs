@@ -67,7 +67,7 @@ impl Drop for Server {
 impl Server {
     fn start(options: &[&str]) -> Self {
         let mut command = Command::new(env!("CARGO_BIN_EXE_freerange"));
-        command.args(["serve", "--port", "0", "--device", "cpu"]).args(options).stdout(Stdio::piped());
+        command.args(["serve", "--port", "0", "--device", "cpu", "--no-token"]).args(options).stdout(Stdio::piped());
         let mut child = command.spawn().unwrap();
         let mut url = String::new();
         BufReader::new(child.stdout.take().unwrap()).read_line(&mut url).unwrap();

@@ -64,7 +64,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     let shown = choose_views(&scene.loaded.views, views)?;
     let found = inspect(&scene.cameras, &scene.loaded, &scene.notes, &frame, &shown);
     let output = OutputFolder::create("inspect", &args.output)?;
-    output.picture("inspect.png", &sheet(&scene.loaded, &found))?;
+    output.picture("inspect.png", &sheet(&scene.loaded, &found)?)?;
     let json = serde_json::to_string_pretty(&found).map_err(CliError::failure)?;
     output.write("inspect.json", json.as_bytes())?;
     write_masks(&output.path("masks")?, &scene.cameras, &scene.loaded)?;

@@ -1,6 +1,16 @@
 //! `freerange serve`
 
-use std::{net::IpAddr, ops::ControlFlow, path::PathBuf, process::Command, sync::Arc, time::Duration};
+use std::{
+    env::VarError,
+    fs::File,
+    io::{Read, Write},
+    net::IpAddr,
+    ops::ControlFlow,
+    path::PathBuf,
+    process::Command,
+    sync::Arc,
+    time::Duration,
+};
 
 use freerange::{
     Camera, Detect, Gaussians, Init, Quality, Reconstructor, View, choose_views, internal::leave_one_out,
@@ -18,7 +28,8 @@ use crate::{error::CliError, pipeline::PipelineArgs, ranks::Job, signals::Signal
 
 /// Serve a web page: drop photos with cameras, correct masks, watch the Gaussians appear.
 ///
-/// Listens on this machine only and loads nothing from elsewhere. Options of the pipeline are the defaults of its jobs. Ctrl-C ends it.
+/// Listens on this machine only and loads nothing from elsewhere. Prints a link with a new access token; whoever has the link may use the
+/// page. Options of the pipeline are the defaults of its jobs. Ctrl-C ends it.
 #[derive(clap::Args)]
 pub struct Args {
     /// Open the page in the browser.
@@ -27,14 +38,18 @@ pub struct Args {
     /// Port to listen at; 0 takes a free one.
     #[arg(long, default_value_t = 7878)]
     port: u16,
-    /// Address to listen at; beyond this machine (0.0.0.0) it needs --token.
+    /// Address to listen at; 0.0.0.0 for all of this machine's.
     #[arg(long, default_value = "127.0.0.1", value_name = "ADDRESS")]
     host: IpAddr,
-    /// Access token: at least 16 letters, digits or - . _ ~.
+    /// File that holds the access token: at least 16 letters, digits or - . _ ~ [default: a new one].
     ///
-    /// Browsers open http://ADDRESS/?token=TOKEN. Programs send the header `Authorization: Bearer TOKEN`.
+    /// Without this option, the environment variable FREERANGE_TOKEN may hold it. Browsers open http://ADDRESS/?token=TOKEN, or ask for the
+    /// token. Programs send the header `Authorization: Bearer TOKEN`.
+    #[arg(long, value_name = "FILE", conflicts_with = "no_token")]
+    token_file: Option<PathBuf>,
+    /// Serve without a token: every user of this machine can see photos and remove jobs.
     #[arg(long)]
-    token: Option<String>,
+    no_token: bool,
     /// Allowed Host header beside addresses, such as the name behind a proxy; may be repeated.
     #[arg(long, value_name = "HOST")]
     name: Vec<String>,
@@ -50,6 +65,15 @@ pub struct Args {
     /// Most megapixels per photo.
     #[arg(long, value_name = "MP", default_value_t = 50, value_parser = clap::value_parser!(u64).range(1..=268))]
     max_pixels: u64,
+    /// Most megabytes of memory for the photos of a job, while they are read.
+    #[arg(long, value_name = "MB", default_value_t = 1024, value_parser = clap::value_parser!(u64).range(16..=1_048_576))]
+    max_memory: u64,
+    /// Most seconds for reading the photos of a job.
+    #[arg(long, value_name = "SECONDS", default_value_t = 300, value_parser = clap::value_parser!(u64).range(1..=604_800))]
+    max_read_time: u64,
+    /// Most megabytes of all jobs on disk.
+    #[arg(long, value_name = "MB", default_value_t = 16_384, value_parser = clap::value_parser!(u64).range(16..=1_048_576_000))]
+    max_disk: u64,
     /// Most open jobs: in preparation, waiting or computing.
     #[arg(long, value_name = "JOBS", default_value_t = 32, value_parser = clap::value_parser!(u16).range(1..=10_000))]
     max_jobs: u16,
@@ -69,10 +93,11 @@ const EXAMPLE: Example = Example {
 
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
+    let token = Token::of(args)?;
     let config = ServeConfig {
         host: args.host,
         port: args.port,
-        token: args.token.clone(),
+        token: token.text.clone(),
         names: args.name.clone(),
         keep: args.keep.clone(),
         example: Some(EXAMPLE),
@@ -82,6 +107,9 @@ pub fn run(args: &Args) -> Result<(), CliError> {
             file_bytes: Limits::default().file_bytes.min(args.max_upload << 20),
             pixels: args.max_pixels * 1_000_000,
             open_jobs: args.max_jobs.into(),
+            memory: args.max_memory << 20,
+            read_time: Duration::from_secs(args.max_read_time),
+            disk: args.max_disk << 20,
             ..Limits::default()
         },
     };
@@ -100,34 +128,77 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     }
     args.pipeline.options(&model, 1)?;
     let place = match &args.pipeline.checkpoint {
-        Some(path) => path.display().to_string(),
+        // Where it lies is nobody's business.
+        Some(path) => path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned(),
         None => "the shipped model".into(),
     };
     let engine = Local { model, pipeline: args.pipeline.clone(), name: format!("{place} on {}", args.pipeline.device) };
     let server = Server::bind(&config, Arc::new(engine))?;
     let stopper = server.stopper();
     signals.on_first(move || stopper.stop())?;
-    let url = match &args.token {
-        Some(token) => format!("{}?token={token}", server.url()),
+    let link = match &token.text {
+        Some(text) => format!("{}?token={text}", server.url()),
         None => server.url(),
     };
-    println!("{url}");
-    if args.open {
-        open(&url);
-    }
+    // A secret that came from elsewhere does not belong into logs.
+    println!("{}", if token.is_new { link.clone() } else { server.url() });
+    let _page = if args.open { open(&link) } else { None };
     server.run().map_err(CliError::failure)
 }
 
-/// Hands the address to the system's browser.
-fn open(url: &str) {
+/// The access token, and where it came from.
+struct Token {
+    text: Option<String>,
+    /// Whether it was drawn just now: nobody knows it yet.
+    is_new: bool,
+}
+
+/// Most bytes of a file with a token.
+const TOKEN_FILE: u64 = 4096;
+
+impl Token {
+    fn of(args: &Args) -> Result<Self, CliError> {
+        if args.no_token {
+            return Ok(Self { text: None, is_new: false });
+        }
+        if let Some(path) = &args.token_file {
+            let mut text = String::new();
+            let read = File::open(path).and_then(|file| file.take(TOKEN_FILE).read_to_string(&mut text));
+            read.map_err(|e| CliError::file(path, e))?;
+            return Ok(Self { text: Some(text.trim().to_owned()), is_new: false });
+        }
+        match std::env::var("FREERANGE_TOKEN") {
+            Ok(text) => Ok(Self { text: Some(text), is_new: false }),
+            Err(VarError::NotPresent) => Ok(Self { text: Some(freerange_serve::draw_token()), is_new: true }),
+            Err(VarError::NotUnicode(_)) => Err(CliError::input("FREERANGE_TOKEN: expected text, found other bytes")),
+        }
+    }
+}
+
+/// Hands the link to the system's browser: in a file that only this user can read, since all users see the arguments of programs. The file is
+/// there as long as what is returned.
+fn open(link: &str) -> Option<tempfile::NamedTempFile> {
+    let text = format!(
+        "<!doctype html><meta http-equiv=\"refresh\" content=\"0; url={link}\"><a href=\"{link}\">free-range</a>\n"
+    );
+    let file = tempfile::Builder::new().prefix("freerange-").suffix(".html").tempfile();
+    let written = file.and_then(|mut file| file.write_all(text.as_bytes()).map(|()| file));
+    let page = match written {
+        Ok(page) => page,
+        Err(e) => {
+            eprintln!("note: --open: {e}; open the address above");
+            return None;
+        }
+    };
     let (program, first): (&str, &[&str]) = match std::env::consts::OS {
         "macos" => ("open", &[]),
         "windows" => ("cmd", &["/C", "start", ""]),
         _ => ("xdg-open", &[]),
     };
-    if let Err(e) = Command::new(program).args(first).arg(url).spawn() {
+    if let Err(e) = Command::new(program).args(first).arg(page.path()).spawn() {
         eprintln!("note: --open: {program}: {e}; open the address above");
     }
+    Some(page)
 }
 
 impl From<ServeError> for CliError {

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use freerange_util::{Invalid, IoError};
+use freerange_util::{Invalid, IoError, Stopped};
 
 /// Why photos cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -160,6 +160,22 @@ pub enum SceneError {
         /// Why.
         reason: String,
     },
+    /// Photos take more memory than they may.
+    #[error(
+        "{photos} photos: expected at most {limit} MB of memory for photos and masks at the size used, found {needed} MB; fewer photos, a \
+         smaller --max-resolution, or masks with them (estimating masks takes several times as much)"
+    )]
+    Memory {
+        /// Their number.
+        photos: usize,
+        /// The limit, in megabytes.
+        limit: u64,
+        /// What they would take, in megabytes.
+        needed: u64,
+    },
+    /// Reading was stopped ([`LoadConfig::stop`](crate::LoadConfig::stop)).
+    #[error(transparent)]
+    Stopped(#[from] Stopped),
     /// An option cannot be used.
     #[error(transparent)]
     Option(#[from] Invalid),

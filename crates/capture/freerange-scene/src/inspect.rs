@@ -1,7 +1,7 @@
 //! What was understood of a scene: numbers, warnings in plain words, and one sheet of pictures.
 
 use crate::camera::{CANONICAL_RADIUS, Camera, CanonicalFrame, View, image_ops::resize_area};
-use crate::{Loaded, MaskKind, estimate, read::Cameras};
+use crate::{Loaded, MaskKind, SceneError, estimate, read::Cameras};
 use freerange_util::{Note, NoteKind};
 use glam::{DQuat, DVec3};
 use image::{Rgba, RgbaImage};
@@ -229,7 +229,10 @@ const WHITE: Rgba<u8> = Rgba([255, 255, 255, 255]);
 
 /// One picture of it all: the cameras from above, and every photo with its mask's outline (green where the model is shown the view, gray
 /// elsewhere; what is not the object is darkened) and the object's sphere (orange); warnings in red.
-pub fn sheet(loaded: &Loaded, inspection: &Inspection) -> RgbaImage {
+///
+/// # Errors
+/// Where a whole photo lies in a file that cannot be read.
+pub fn sheet(loaded: &Loaded, inspection: &Inspection) -> Result<RgbaImage, SceneError> {
     let columns = match loaded.views.len() + 1 {
         n @ 0..=3 => n as u32,
         4..=12 => 4,
@@ -255,7 +258,7 @@ pub fn sheet(loaded: &Loaded, inspection: &Inspection) -> RgbaImage {
     for (i, (view, report)) in loaded.views.iter().zip(&inspection.views).enumerate() {
         let place = i as u32 + 1;
         let (x, y) = (place % columns * TILE, head + place / columns * (TILE + 2 * LINE));
-        let picture = tile(view, &loaded.whole[i], report, center, radius);
+        let picture = tile(view, &*loaded.whole.get(i)?, report, center, radius);
         image::imageops::overlay(&mut sheet, &picture, i64::from(x), i64::from(y + LINE));
         let ink = if report.doubtful() || report.cut_off { RED } else { INK };
         let line = format!(
@@ -267,7 +270,7 @@ pub fn sheet(loaded: &Loaded, inspection: &Inspection) -> RgbaImage {
         );
         text(&mut sheet, x + 4, y + 2, &line, ink);
     }
-    sheet
+    Ok(sheet)
 }
 
 fn tile(view: &View, whole: &RgbaImage, report: &ViewReport, center: DVec3, radius: f64) -> RgbaImage {

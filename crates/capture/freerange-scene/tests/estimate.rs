@@ -7,6 +7,7 @@ use freerange_scene::{
     load,
     read::cameras,
 };
+use freerange_util::Stop;
 use glam::DVec3;
 use image::{Rgba, RgbaImage};
 use std::path::PathBuf;
@@ -115,7 +116,7 @@ fn an_object_on_a_table_is_cut_out() {
         })
         .collect();
     let whole: Vec<RgbaImage> = views.iter().map(|v| v.image.clone()).collect();
-    assert!(table_faces(&cut, &whole).unwrap().angle_between(DVec3::Z) < 0.02);
+    assert!(table_faces(&cut, |k| Some(whole[k].clone())).unwrap().angle_between(DVec3::Z) < 0.02);
     // True masks agree with their hull; a mask in another's place does not.
     let center = DVec3::new(0.0, 0.0, 0.13);
     assert!(agreement(&cut, center, 0.4).iter().all(|a| *a > 0.85));
@@ -130,7 +131,7 @@ fn the_same_photos_give_the_same_masks() {
 }
 
 /// What the others would show, were they to know all: where the object is, and the color that it has there.
-fn truth_shown(views: &[View]) -> Result<Vec<RgbaImage>, String> {
+fn truth_shown(views: &[View], _: &Stop) -> Result<Vec<RgbaImage>, String> {
     let shown = |v: &View| {
         let (mut image, (_, mask)) = (v.image.clone(), draw(&v.camera));
         image.pixels_mut().zip(mask).for_each(|(p, m)| p[3] = if m { 255 } else { 0 });
@@ -170,9 +171,9 @@ fn masks_stay_as_they_are_where_other_views_show_nothing() {
     let (views, _) = scene();
     let of = |views: &[View], others| masks(views, &Hints { others, ..Hints::default() }).unwrap();
     let plain = of(&views, None);
-    let fails: LeaveOneOut = |_| Err("it is dark".into());
-    let small: LeaveOneOut = |views| Ok(vec![RgbaImage::new(3, 2); views.len()]);
-    let fewer: LeaveOneOut = |views| Ok(views[1..].iter().map(|v| v.image.clone()).collect());
+    let fails: LeaveOneOut = |_, _| Err("it is dark".into());
+    let small: LeaveOneOut = |views, _| Ok(vec![RgbaImage::new(3, 2); views.len()]);
+    let fewer: LeaveOneOut = |views, _| Ok(views[1..].iter().map(|v| v.image.clone()).collect());
     for (others, words) in [(fails, "it is dark"), (small, "expected 8 pictures"), (fewer, "expected 8 pictures")] {
         let found = of(&views, Some(others));
         assert_eq!(found.alpha, plain.alpha);
@@ -180,7 +181,7 @@ fn masks_stay_as_they_are_where_other_views_show_nothing() {
         assert!(told.len() == 1 && told[0].contains(words), "{told:?}");
     }
     // Too few for the others to know anything: they are not asked.
-    let never: LeaveOneOut = |_| panic!("asked");
+    let never: LeaveOneOut = |_, _| panic!("asked");
     assert_eq!(of(&views[..4], Some(never)).alpha, of(&views[..4], None).alpha);
 }
 

@@ -114,7 +114,7 @@ fn masks_are_found_by_every_naming() {
     let loaded = load(&found, &LoadConfig::default()).unwrap();
     assert_eq!(loaded.masks, MaskKind::Files);
     loaded.views.iter().for_each(|v| assert_cut(&v.image));
-    assert_eq!(loaded.whole[0].get_pixel(0, 0).0, [0, 0, 90, 255], "the whole photo is kept");
+    assert_eq!(loaded.whole.get(0).unwrap().get_pixel(0, 0).0, [0, 0, 90, 255], "the whole photo is kept");
 
     // Written by one, read by the other, black for white.
     let mut inverted = mask(W, H);

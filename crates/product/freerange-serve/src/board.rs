@@ -1,7 +1,10 @@
 //! The jobs: who waits, who computes, what is there of each.
 
 mod arriving;
+mod bin;
 mod orders;
+mod read;
+mod results;
 mod shown;
 mod table;
 mod work;
@@ -18,9 +21,11 @@ use std::{
 
 use freerange_util::IoError;
 
+pub use self::arriving::Submission;
 use self::table::{Job, Table};
 use crate::{
     Engine, Limits, Refusal, ServeError,
+    disk::size_of,
     metrics::Metrics,
     record::{Record, State},
     scene,
@@ -37,6 +42,8 @@ pub struct Board {
     table: Mutex<Table>,
     changed: Condvar,
     editing: Mutex<()>,
+    doomed: Mutex<Vec<PathBuf>>,
+    doom_changed: Condvar,
     stopping: AtomicBool,
     pub metrics: Metrics,
 }
@@ -75,6 +82,8 @@ impl Board {
             table: Mutex::default(),
             changed: Condvar::new(),
             editing: Mutex::new(()),
+            doomed: Mutex::default(),
+            doom_changed: Condvar::new(),
             stopping: AtomicBool::new(false),
             metrics: Metrics::new(),
         };
@@ -85,6 +94,10 @@ impl Board {
     /// Takes over what an earlier server left: finished and waiting jobs as they are, others as interrupted.
     fn recover(&self) -> std::io::Result<()> {
         let mut table = self.table();
+        if self.bin().is_dir() {
+            // What was removed is gone for good with this start.
+            fs::read_dir(self.bin())?.flatten().for_each(|entry| self.doom(entry.path()));
+        }
         for entry in fs::read_dir(&self.root)? {
             let entry = entry?;
             let Ok(id) = entry.file_name().into_string() else { continue };
@@ -117,7 +130,8 @@ impl Board {
                 record.write(&folder)?;
             }
             table.turns = table.turns.max(record.turn);
-            let job = table.job(record, folder);
+            let mut job = table.job(record, folder);
+            job.bytes = size_of(&job.folder);
             table.jobs.insert(id, job);
         }
         Ok(())
@@ -135,16 +149,30 @@ impl Board {
         &self.limits
     }
 
-    /// Changes a job under the lock, writes its record, and tells everyone who looks.
+    /// What makes changes of a job come one after the other. Taken before the table is.
+    fn writing(&self, id: &str) -> Result<Arc<Mutex<()>>, Refusal> {
+        Ok(self.table().jobs.get(id).ok_or_else(no_such)?.writing.clone())
+    }
+
+    /// Changes a job, writes its record, and tells everyone who looks. The disk may take its time: meanwhile others see the job as it was, and
+    /// nobody waits for the table.
     fn change<T>(&self, id: &str, change: impl FnOnce(&mut Job) -> Result<T, Refusal>) -> Result<T, Refusal> {
+        let writing = self.writing(id)?;
+        let _one = writing.lock().unwrap_or_else(PoisonError::into_inner);
+        let (result, record, folder) = {
+            let mut table = self.table();
+            let job = table.jobs.get_mut(id).ok_or_else(no_such)?;
+            let before = job.record.clone();
+            let result = change(job)?;
+            (result, std::mem::replace(&mut job.record, before), job.folder.clone())
+        };
+        let written = record.write(&folder).map_err(Refusal::own);
         let mut table = self.table();
         let version = table.next_version();
         let job = table.jobs.get_mut(id).ok_or_else(no_such)?;
-        let result = change(job)?;
-        (job.version, job.touched) = (version, Instant::now());
-        job.record.write(&job.folder).map_err(Refusal::own)?;
+        (job.record, job.version, job.touched) = (record, version, Instant::now());
         self.changed.notify_all();
-        Ok(result)
+        written.map(|()| result)
     }
 
     /// Ends: whoever waits hears of it, whoever computes stops.
@@ -153,6 +181,9 @@ impl Board {
         let table = self.table();
         table.jobs.values().for_each(|j| j.cancel.store(true, Relaxed));
         self.changed.notify_all();
+        drop(table);
+        let _doomed = self.doomed.lock().unwrap_or_else(PoisonError::into_inner);
+        self.doom_changed.notify_all();
     }
 
     /// Takes a temporary folder away, after all threads that use it have ended.

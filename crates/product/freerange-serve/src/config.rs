@@ -9,11 +9,12 @@ use crate::ServeError;
 /// How a server is set up.
 #[derive(Clone, Debug)]
 pub struct ServeConfig {
-    /// Where it listens; beyond loopback it needs a token.
+    /// Where it listens; beyond loopback a token is needed.
     pub host: IpAddr,
     /// 0 takes a free one.
     pub port: u16,
-    /// What clients have to know.
+    /// What clients have to know: see [`draw_token`](crate::draw_token). Without one, whoever has an account on this machine may use the
+    /// page, see its photos and remove its jobs.
     pub token: Option<String>,
     /// Names, beside addresses, under which browsers may reach it.
     pub names: Vec<String>,
@@ -49,10 +50,18 @@ pub struct Limits {
     pub job_pixels: u64,
     /// Longer side of the photos in use; larger ones are made smaller.
     pub side: u32,
+    /// Bytes of memory that the photos of one job take while they are read, at the size used, with their masks.
+    pub memory: u64,
+    /// Jobs whose photos are read at the same time.
+    pub readers: usize,
+    /// Bytes on disk of all jobs together.
+    pub disk: u64,
     /// Jobs that are read, looked at, wait or compute.
     pub open_jobs: usize,
     /// Finished jobs. Beyond that, new ones are refused where jobs are kept, else the oldest is forgotten.
     pub finished_jobs: usize,
+    /// A job whose photos are read for longer is ended.
+    pub read_time: Duration,
     /// A job that computes longer is ended.
     pub job_time: Duration,
     /// A job that waits longer for someone to press go makes way where there is no room for new ones.
@@ -61,7 +70,11 @@ pub struct Limits {
     pub request_time: Duration,
     /// A head of a request that takes longer is ended.
     pub head_time: Duration,
-    /// Connections at a time.
+    /// An answer that a client takes longer to read is ended.
+    pub answer_time: Duration,
+    /// A stream of events ends after this time; the page opens a new one.
+    pub stream_time: Duration,
+    /// Connections at a time; two thirds of them may be streams of events. Some more are kept for `/health` and `/metrics`.
     pub connections: usize,
 }
 
@@ -74,12 +87,18 @@ impl Default for Limits {
             pixels: 50_000_000,
             job_pixels: 1_000_000_000,
             side: 1024,
+            memory: 1 << 30,
+            readers: 2,
+            disk: 16 << 30,
+            read_time: Duration::from_secs(300),
             open_jobs: 32,
             finished_jobs: 200,
             job_time: Duration::from_secs(900),
             idle_time: Duration::from_secs(600),
             request_time: Duration::from_secs(300),
             head_time: Duration::from_secs(10),
+            answer_time: Duration::from_secs(300),
+            stream_time: Duration::from_secs(300),
             connections: 96,
         }
     }
@@ -110,17 +129,15 @@ impl ServeConfig {
     pub fn check(&self) -> Result<(), ServeError> {
         let refuse = |option: &str, expected: String, found: String| Err(Invalid::new(option, expected, found).into());
         match &self.token {
-            None if !self.host.is_loopback() => refuse(
-                "--token",
-                format!("a secret of {TOKEN} characters or more, to listen at {}", self.host),
-                "none".into(),
-            ),
+            None if !self.host.is_loopback() => {
+                refuse("token", format!("one, to listen at {}", self.host), "none (--no-token)".into())
+            }
             Some(token)
                 if token.len() < TOKEN || !token.bytes().all(|b| b.is_ascii_alphanumeric() || b"-._~".contains(&b)) =>
             {
                 // Secrets do not belong into messages.
                 let found = format!("{} characters", token.chars().count());
-                refuse("--token", format!("{TOKEN} letters, digits or - . _ ~, or more"), found)
+                refuse("token", format!("{TOKEN} letters, digits or - . _ ~, or more"), found)
             }
             _ => Ok(()),
         }?;

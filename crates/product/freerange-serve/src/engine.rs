@@ -99,6 +99,9 @@ pub enum Init {
     Flow,
 }
 
+/// Most samples of a job.
+pub(crate) const MOST_SAMPLES: usize = 8;
+
 impl JobOptions {
     /// Refuses what would take too long, with a sentence for the user.
     pub(crate) fn check(&self) -> Result<(), String> {
@@ -106,7 +109,7 @@ impl JobOptions {
             Some(v) if !(low..=high).contains(&v) => Err(format!("{name}: expected {low} to {high}, found {v}")),
             _ => Ok(()),
         };
-        within("samples", self.samples.map(u64::from), 1, 8)?;
+        within("samples", self.samples.map(u64::from), 1, MOST_SAMPLES as u64)?;
         // Numbers of JavaScript are exact up to here.
         within("seed", self.seed, 0, (1 << 53) - 1)?;
         within("iterations", self.iterations.map(|v| v as u64), 0, 5000)

@@ -4,8 +4,16 @@ use std::net::IpAddr;
 
 use crate::{Refusal, ServeConfig, http::Request};
 
-/// The cookie that holds the token.
-pub const COOKIE: &str = "freerange_token";
+/// A new token: 192 random bits in hexadecimal digits.
+pub fn draw_token() -> String {
+    format!("{:032x}{:016x}", rand::random::<u128>(), rand::random::<u64>())
+}
+
+/// The name of the cookie that holds the token. Cookies of a host are sent to all its ports: each has a name of its own.
+pub fn cookie(request: &Request) -> String {
+    let port = request.header("host").and_then(|host| host.rsplit_once(':')?.1.parse::<u16>().ok());
+    format!("freerange_token_{}", port.unwrap_or(80))
+}
 
 /// What is checked of every request.
 pub struct Guard {
@@ -72,10 +80,16 @@ impl Guard {
     pub fn admits(&self, request: &Request) -> bool {
         let Some(token) = &self.token else { return true };
         let bearer = request.header("authorization").and_then(|v| v.strip_prefix("Bearer "));
+        let name = cookie(request);
         let cookie = request
             .header("cookie")
-            .and_then(|v| v.split(';').find_map(|pair| pair.trim().strip_prefix(COOKIE)?.strip_prefix('=')));
+            .and_then(|v| v.split(';').find_map(|pair| pair.trim().strip_prefix(&*name)?.strip_prefix('=')));
         [bearer, cookie].into_iter().flatten().any(|told| same(told, token))
+    }
+
+    /// Whether there is a token.
+    pub fn asks(&self) -> bool {
+        self.token.is_some()
     }
 
     /// Whether `told`, from a form, is the token.

@@ -13,7 +13,7 @@ use crate::Refusal;
 const HEAD: usize = 16 << 10;
 /// Most headers of a request.
 const HEADERS: usize = 64;
-/// A client that reads nothing for so long is let go.
+/// A client that reads nothing for so long is let go, however long the whole answer may take.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(20);
 /// Longest wait for a client that goes on sending after it was answered.
 const LINGER: Duration = Duration::from_secs(3);
@@ -208,8 +208,36 @@ struct Head {
     early: Vec<u8>,
 }
 
+/// A connection that is written to until a deadline.
+pub struct Until {
+    stream: TcpStream,
+    deadline: Instant,
+}
+
+impl Until {
+    /// Whether the deadline has passed.
+    pub fn is_over(&self) -> bool {
+        Instant::now() >= self.deadline
+    }
+}
+
+impl Write for Until {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let left = self.deadline.saturating_duration_since(Instant::now());
+        if left.is_zero() {
+            return Err(io::ErrorKind::TimedOut.into());
+        }
+        self.stream.set_write_timeout(Some(left.min(WRITE_TIMEOUT)))?;
+        self.stream.write(bytes)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.stream.flush()
+    }
+}
+
 /// What writes to a client as long as it wants to.
-type Writes = dyn FnOnce(&mut TcpStream) -> io::Result<()> + Send;
+type Writes = dyn FnOnce(&mut Until) -> io::Result<()> + Send;
 
 /// What an answer holds.
 pub enum Content {
@@ -252,16 +280,16 @@ impl Response {
         self
     }
 
-    /// Sends it, without the content where only the head was asked for, and ends the connection.
-    pub fn send(self, mut stream: TcpStream, head_only: bool) {
-        let _ = stream.set_write_timeout(Some(WRITE_TIMEOUT));
+    /// Sends it, without the content where only the head was asked for, and ends the connection; within `most`, whatever the client does.
+    pub fn send(self, stream: TcpStream, head_only: bool, most: Duration) {
+        let mut until = Until { stream, deadline: Instant::now() + most };
         // A client that has gone is told nothing.
-        if self.write(&mut stream, head_only).is_ok() {
-            linger(&stream);
+        if self.write(&mut until, head_only).is_ok() {
+            linger(&until.stream);
         }
     }
 
-    fn write(self, stream: &mut TcpStream, head_only: bool) -> io::Result<()> {
+    fn write(self, stream: &mut Until, head_only: bool) -> io::Result<()> {
         let mut head = format!("HTTP/1.1 {} {}\r\nContent-Type: {}\r\n", self.status, reason(self.status), self.kind);
         let length = match &self.content {
             Content::Bytes(bytes) => Some(bytes.len() as u64),
@@ -301,7 +329,8 @@ const COMMON: [(&str, &str); 7] = [
     ),
     ("X-Content-Type-Options", "nosniff"),
     ("X-Frame-Options", "DENY"),
-    ("Referrer-Policy", "no-referrer"),
+    // Forms of this page tell their origin; others hear nothing.
+    ("Referrer-Policy", "same-origin"),
     ("Cross-Origin-Opener-Policy", "same-origin"),
     ("Cross-Origin-Resource-Policy", "same-origin"),
     ("Cache-Control", "no-store"),
@@ -339,5 +368,31 @@ fn reason(status: u16) -> &'static str {
         503 => "Service Unavailable",
         507 => "Insufficient Storage",
         _ => "Internal Server Error",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::TcpListener;
+
+    use super::*;
+
+    #[test]
+    fn a_client_that_reads_slowly_is_let_go() {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let mut client = TcpStream::connect(listener.local_addr().unwrap()).unwrap();
+        let (server, _) = listener.accept().unwrap();
+        let reader = std::thread::spawn(move || {
+            // Some bytes now and then: no single write waits for long.
+            let mut few = [0; 4096];
+            while matches!(client.read(&mut few), Ok(n) if n > 0) {
+                std::thread::sleep(Duration::from_millis(2));
+            }
+        });
+        let begin = Instant::now();
+        let large = Response::new("text/plain", Content::Bytes(vec![0; 256 << 20]));
+        large.send(server, false, Duration::from_millis(500));
+        assert!(begin.elapsed() < Duration::from_secs(10), "{:?}", begin.elapsed());
+        drop(reader);
     }
 }

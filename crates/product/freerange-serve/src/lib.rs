@@ -5,7 +5,7 @@
 //!
 //! What clients send is bounded in bytes, pixels, files, jobs and time ([`Limits`]) before anything is decoded. Names of clients never
 //! become paths of ours: they name files below a job's own folder, after they were taken apart. `Host` and `Origin` are checked, so that
-//! pages of other sites cannot use a browser to get here, and beyond loopback nobody is served without a token.
+//! pages of other sites cannot use a browser to get here. Where there is a token ([`draw_token`]), nobody is served without it.
 //!
 //! Architecture invariant: no tensors and no neural network: the engine behind the page is a trait ([`Engine`]).
 
@@ -13,6 +13,7 @@
 
 mod board;
 mod config;
+mod disk;
 mod engine;
 mod error;
 mod guard;
@@ -20,6 +21,7 @@ mod http;
 mod metrics;
 mod multipart;
 mod page;
+mod plain;
 mod record;
 mod routes;
 mod scene;
@@ -29,4 +31,5 @@ mod upload;
 pub use config::{Example, Limits, ServeConfig};
 pub use engine::{Engine, EngineError, Init, JobOptions, Outcome, Quality, Scene, Step, Symmetry};
 pub use error::{Refusal, ServeError};
+pub use guard::draw_token;
 pub use server::{Server, Stopper};

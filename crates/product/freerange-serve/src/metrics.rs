@@ -19,6 +19,7 @@ pub struct Metrics {
     ended: Mutex<BTreeMap<&'static str, u64>>,
     pub connections: AtomicU64,
     pub turned_away: AtomicU64,
+    pub streams: AtomicU64,
     pub uploaded: AtomicU64,
     pub estimates: AtomicU64,
     pub milliseconds: AtomicU64,
@@ -32,6 +33,7 @@ impl Metrics {
             ended: Mutex::default(),
             connections: AtomicU64::new(0),
             turned_away: AtomicU64::new(0),
+            streams: AtomicU64::new(0),
             uploaded: AtomicU64::new(0),
             estimates: AtomicU64::new(0),
             milliseconds: AtomicU64::new(0),
@@ -47,7 +49,7 @@ impl Metrics {
     }
 
     /// The page of text. `jobs`: how many there are in each state.
-    pub fn text(&self, jobs: &BTreeMap<&'static str, usize>) -> String {
+    pub fn text(&self, jobs: &BTreeMap<&'static str, usize>, disk: u64) -> String {
         let mut text = String::new();
         let mut family = |name: &str, kind: &str, help: &str, rows: &[(String, f64)]| {
             let _ = writeln!(text, "# HELP freerange_{name} {help}\n# TYPE freerange_{name} {kind}");
@@ -66,12 +68,14 @@ impl Metrics {
         let answers: Vec<_> = answers.iter().map(|(s, n)| (format!("{{status=\"{s}\"}}"), *n as f64)).collect();
         family("answers_total", "counter", "Answers by status.", &answers);
         family("connections", "gauge", "Connections that are open.", &count(&self.connections));
+        family("streams", "gauge", "Streams of events that are open.", &count(&self.streams));
         family("turned_away_total", "counter", "Connections beyond the limit.", &count(&self.turned_away));
         family("uploaded_bytes_total", "counter", "Bytes of files that were taken.", &count(&self.uploaded));
         family("estimates_total", "counter", "Estimates that were published.", &count(&self.estimates));
         let busy = self.milliseconds.load(Relaxed) as f64 / 1e3;
         family("computing_seconds_total", "counter", "Seconds in which a job was computed.", &plain(busy));
         family("up_seconds", "gauge", "Seconds since the start.", &plain(self.begin.elapsed().as_secs_f64()));
+        family("disk_bytes", "gauge", "Files of all jobs.", &plain(disk as f64));
         if let Some(bytes) = resident() {
             family("resident_bytes", "gauge", "Memory of the process.", &plain(bytes as f64));
         }

@@ -2,16 +2,35 @@
 
 use freerange_gaussians::formats::viewer;
 
-/// Its files: address, kind, content. The drawing is that of the page that Gaussians are exported to.
-pub const FILES: [(&str, &str, &str); 4] = [
+const SCRIPT: &str = "text/javascript; charset=utf-8";
+const STYLE: (&str, &str, &str) = ("/style.css", "text/css; charset=utf-8", include_str!("page/style.css"));
+
+/// Its files: address, kind, content. The drawing is that of the page that Gaussians are exported to; the other scripts are modules of one
+/// thing each.
+pub const FILES: [(&str, &str, &str); 14] = [
     ("/", "text/html; charset=utf-8", include_str!("page/index.html")),
-    ("/style.css", "text/css; charset=utf-8", include_str!("page/style.css")),
-    ("/viewer.js", "text/javascript; charset=utf-8", viewer::SCRIPT),
-    ("/page.js", "text/javascript; charset=utf-8", include_str!("page/page.js")),
+    STYLE,
+    ("/viewer.js", SCRIPT, viewer::SCRIPT),
+    ("/main.js", SCRIPT, include_str!("page/main.js")),
+    ("/jobs.js", SCRIPT, include_str!("page/jobs.js")),
+    ("/job.js", SCRIPT, include_str!("page/job.js")),
+    ("/gaussians.js", SCRIPT, include_str!("page/gaussians.js")),
+    ("/panes.js", SCRIPT, include_str!("page/panes.js")),
+    ("/brush.js", SCRIPT, include_str!("page/brush.js")),
+    ("/edit.js", SCRIPT, include_str!("page/edit.js")),
+    ("/send.js", SCRIPT, include_str!("page/send.js")),
+    ("/record.js", SCRIPT, include_str!("page/record.js")),
+    ("/dom.js", SCRIPT, include_str!("page/dom.js")),
+    ("/state.js", SCRIPT, include_str!("page/state.js")),
 ];
 
-/// Asks for the token.
+/// What those may have who do not know the token.
+pub const OPEN: [(&str, &str, &str); 2] = [STYLE, ("/enter.js", SCRIPT, include_str!("page/enter.js"))];
+
+/// Asks for the token; the same after a wrong one; and goes on to the page by itself.
 pub const LOGIN: &str = include_str!("page/login.html");
+pub const REFUSED: &str = include_str!("page/refused.html");
+pub const ENTER: &str = include_str!("page/enter.html");
 
 #[cfg(test)]
 mod tests {
@@ -20,8 +39,9 @@ mod tests {
     #[test]
     fn the_page_is_small_and_names_nothing_outside() {
         let size: usize = FILES.iter().map(|(_, _, text)| text.len()).sum();
-        assert!(size < 100_000, "{size} bytes");
-        for (name, _, text) in FILES {
+        assert!(size < 120_000, "{size} bytes");
+        let others = [LOGIN, REFUSED, ENTER].map(|text| ("before the token", "", text));
+        for (name, _, text) in FILES.into_iter().chain(OPEN).chain(others) {
             for odd in [
                 "https://",
                 "http://",

@@ -3,10 +3,9 @@
 use std::{
     fs::File,
     io::{self, Write},
-    net::TcpStream,
     path::Path,
     sync::{Arc, atomic::Ordering::Relaxed},
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use freerange_gaussians::formats::Format;
@@ -14,9 +13,9 @@ use serde_json::json;
 
 use crate::{
     Example, JobOptions, Refusal,
-    board::{Board, is_id},
-    guard::{COOKIE, Guard},
-    http::{Content, Request, Response},
+    board::{Board, Submission, is_id},
+    guard::{Guard, cookie},
+    http::{Content, Request, Response, Until},
     multipart::{Multipart, boundary},
     page, record,
     scene::{self, SceneOptions},
@@ -27,6 +26,8 @@ use crate::{
 const TEXT: u64 = 64 << 10;
 /// Most bytes of a mask.
 const MASK: u64 = 16 << 20;
+/// Most Gaussians that a client may choose among, a byte each.
+const KEPT: u64 = 16 << 20;
 /// Most photos a client may number.
 const PHOTOS: usize = 10_000;
 /// A stream without news says so after this time, so that it is noticed when a client has gone.
@@ -56,7 +57,13 @@ pub fn serve(site: &Site, mut request: Request) {
     }
     let response = answer(site, &mut request).unwrap_or_else(|e| refused(&e));
     site.board.metrics.answered(response.status);
-    response.send(request.into_stream(), head_only);
+    let limits = site.board.limits();
+    // A stream ends by itself; its last event may take a moment.
+    let most = match response.content {
+        Content::Stream(_) => limits.stream_time + HEARTBEAT,
+        _ => limits.answer_time,
+    };
+    response.send(request.into_stream(), head_only, most);
 }
 
 fn missing() -> Refusal {
@@ -88,7 +95,7 @@ fn answer(site: &Site, request: &mut Request) -> Answer {
     }
     match (request.method.as_str(), &parts[..]) {
         ("GET", ["metrics"]) => {
-            let text = board.metrics.text(&board.counts());
+            let text = board.metrics.text(&board.counts(), board.disk());
             Ok(Response::new("text/plain; version=0.0.4; charset=utf-8", Content::Bytes(text.into_bytes())))
         }
         ("GET", ["server"]) => Ok(server(site)),
@@ -96,6 +103,15 @@ fn answer(site: &Site, request: &mut Request) -> Answer {
         ("POST", ["jobs"]) => post(site, request),
         ("GET", ["jobs", id]) => Ok(Response::json(&board.get(id)?)),
         ("DELETE", ["jobs", id]) => board.remove(id).map(|()| Response::json(&json!({}))),
+        ("POST", ["jobs", id, "restore"]) => {
+            board.restore(id)?;
+            Ok(Response::json(&board.get(id)?))
+        }
+        ("PUT", ["jobs", id, "title"]) => {
+            let Title { title } = body(request)?;
+            board.rename(id, &title)?;
+            Ok(Response::json(&board.get(id)?))
+        }
         ("POST", ["jobs", id, "go"]) => {
             let options: JobOptions = body(request)?;
             board.go(id, options)?;
@@ -110,7 +126,7 @@ fn answer(site: &Site, request: &mut Request) -> Answer {
             let rows = board.estimate(id, number(n, usize::MAX)? as u64, number(sample, 64)?)?;
             Ok(Response::new("application/octet-stream", Content::Bytes(rows.to_vec())))
         }
-        ("GET", ["jobs", id, "samples", name]) => sample(board, id, name),
+        (_, ["jobs", id, "samples", rest @ ..]) => samples(board, request, id, rest),
         ("PUT", ["jobs", id, "masks", k]) => {
             let png = request.body(MASK)?;
             let covers = board.edit_mask(id, number(k, PHOTOS)?, &png)?;
@@ -135,22 +151,53 @@ fn answer(site: &Site, request: &mut Request) -> Answer {
     }
 }
 
-/// Where there is a token: takes it from the address into a cookie, and keeps out who does not know it.
-fn login(site: &Site, request: &Request) -> Option<Answer> {
-    if request.path == "/" && request.method == "GET" {
-        let told = request.query.split('&').find_map(|pair| pair.strip_prefix("token="));
-        if let Some(token) = told.filter(|t| site.guard.is_token(t)) {
-            let cookie = format!("{COOKIE}={token}; Path=/; HttpOnly; SameSite=Strict");
-            let there = Response::text(String::new()).status(303);
-            return Some(Ok(there.header("Location", "/").header("Set-Cookie", cookie)));
-        }
+/// A job's new title.
+#[derive(Default, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Title {
+    title: String,
+}
+
+/// Where there is a token: takes it from the address or the form into a cookie, and keeps out who does not know it.
+fn login(site: &Site, request: &mut Request) -> Option<Answer> {
+    if !site.guard.asks() {
+        return None;
+    }
+    // What the page that asks needs itself.
+    if let Some((_, kind, text)) = page::OPEN.iter().find(|(name, ..)| *name == request.path && request.method == "GET")
+    {
+        return Some(Ok(Response::new(kind, Content::Text(text))));
+    }
+    let mut told = None;
+    if request.path == "/" {
+        let form = match request.method.as_str() {
+            "GET" => request.query.clone(),
+            "POST" => match request.body(TEXT) {
+                Ok(bytes) => String::from_utf8_lossy(&bytes).into_owned(),
+                Err(e) => return Some(Err(e)),
+            },
+            _ => String::new(),
+        };
+        told = form.split('&').find_map(|pair| pair.strip_prefix("token=").map(str::to_owned));
+    }
+    if let Some(token) = told.as_deref().filter(|t| site.guard.is_token(t)) {
+        let cookie = format!("{}={token}; Path=/; HttpOnly; SameSite=Strict", cookie(request));
+        // No redirect: a browser that follows a link of another site sends no Strict cookie to where it leads. This page goes on by itself.
+        let enter = Response::new("text/html; charset=utf-8", Content::Text(page::ENTER));
+        return Some(Ok(enter.header("Set-Cookie", cookie)));
     }
     if site.guard.admits(request) {
         return None;
     }
     if request.path == "/" {
-        let ask = Response::new("text/html; charset=utf-8", Content::Text(page::LOGIN));
-        return Some(Ok(ask.status(401)));
+        // Whoever followed a link of another site may have the cookie all the same: asked again from here, the browser sends it.
+        let elsewhere = matches!(request.header("sec-fetch-site"), Some("cross-site" | "same-site"));
+        let text = match (elsewhere && told.is_none(), told) {
+            (true, _) => page::ENTER,
+            (_, None) => page::LOGIN,
+            (_, Some(_)) => page::REFUSED,
+        };
+        return Some(Ok(Response::new("text/html; charset=utf-8", Content::Text(text)).status(401)));
     }
     Some(Ok(refused(&Refusal::new(401, "the token is needed: Authorization: Bearer TOKEN"))
         .header("WWW-Authenticate", "Bearer")))
@@ -164,6 +211,8 @@ fn server(site: &Site) -> Response {
         "example": site.example.map(|e| e.name),
         "limits": {
             "bytes": limits.bytes, "file_bytes": limits.file_bytes, "files": limits.files, "pixels": limits.pixels,
+            "job_pixels": limits.job_pixels, "side": limits.side, "memory": limits.memory, "disk": limits.disk,
+            "read_seconds": limits.read_time.as_secs(), "job_seconds": limits.job_time.as_secs(),
         },
     }))
 }
@@ -184,7 +233,7 @@ fn post(site: &Site, request: &mut Request) -> Answer {
     // Headers of parts count, too.
     request.at_most(limits.bytes + (1 << 20))?;
     let kind = boundary(request.header("content-type"))?.to_owned();
-    let arriving = board.arrive()?;
+    let arriving = board.arrive(request.length)?;
     let folder = arriving.upload.clone();
     let mut upload = Upload::new(&folder, &limits);
     let mut scene = SceneOptions::default();
@@ -239,8 +288,26 @@ fn post(site: &Site, request: &mut Request) -> Answer {
     board.metrics.uploaded.fetch_add(upload.bytes, Relaxed);
     let title = upload.title.take().unwrap_or_default();
     let passed_over = std::mem::take(&mut upload.passed_over);
-    let id = arriving.submit(title, scene, options, passed_over)?;
+    let bytes = upload.bytes;
+    let id = arriving.submit(Submission { title, scene, go: options, passed_over, bytes })?;
     Ok(Response::json(&board.get(&id)?).status(201))
+}
+
+/// What is below the samples of a job.
+fn samples(board: &Board, request: &mut Request, id: &str, rest: &[&str]) -> Answer {
+    match (request.method.as_str(), rest) {
+        ("GET", [name]) => sample(board, id, name),
+        ("GET", [i, what @ ("whole" | "kept")]) => {
+            let i = number(i, 64)?;
+            let bytes = if *what == "kept" { board.kept(id, i)? } else { board.whole_rows(id, i)? };
+            Ok(Response::new("application/octet-stream", Content::Bytes(bytes)))
+        }
+        ("PUT", [i, "kept"]) => {
+            let kept = request.body(KEPT)?;
+            Ok(Response::json(&json!({ "gaussians": board.keep(id, number(i, 64)?, &kept)? })))
+        }
+        _ => Err(missing()),
+    }
 }
 
 fn sample(board: &Board, id: &str, name: &str) -> Answer {
@@ -261,15 +328,46 @@ fn picture(path: &Path) -> Answer {
     Ok(Response::new("image/png", Content::File(file, length)))
 }
 
+/// One of the streams that may be open at a time: they leave places for all else.
+struct StreamPlace(Arc<Board>);
+
+impl StreamPlace {
+    fn take(board: &Arc<Board>) -> Result<Self, Refusal> {
+        let place = Self(board.clone());
+        let before = board.metrics.streams.fetch_add(1, Relaxed);
+        let most = (board.limits().connections as u64 * 2).div_ceil(3);
+        match before < most {
+            true => Ok(place),
+            false => {
+                Err(Refusal::new(503, format!("{most} streams of events are open, which is all there is room for")))
+            }
+        }
+    }
+}
+
+impl Drop for StreamPlace {
+    fn drop(&mut self) {
+        self.0.metrics.streams.fetch_sub(1, Relaxed);
+    }
+}
+
 /// Server-sent events: the job's status, whenever it changes, until it is gone or the client is.
 fn events(site: &Site, id: &str) -> Answer {
     let (board, id) = (site.board.clone(), id.to_owned());
     board.folder(&id)?;
-    let write = move |stream: &mut TcpStream| -> io::Result<()> {
+    let place = StreamPlace::take(&board)?;
+    let end = Instant::now() + board.limits().stream_time;
+    let write = move |stream: &mut Until| -> io::Result<()> {
+        let _place = place;
         let mut version = 0;
         stream.write_all(b"retry: 1000\n\n")?;
         loop {
-            match board.wait(&id, version, HEARTBEAT) {
+            let left = end.saturating_duration_since(Instant::now());
+            if left.is_zero() || stream.is_over() {
+                // The page opens another one.
+                return Ok(());
+            }
+            match board.wait(&id, version, HEARTBEAT.min(left)) {
                 Ok(Some((newer, status))) => {
                     version = newer;
                     stream.write_all(format!("event: job\nid: {version}\ndata: {status}\n\n").as_bytes())?;

@@ -11,14 +11,14 @@ use freerange_scene::{
     LoadConfig, MaskSource, SceneConfig, SceneError,
     estimate::Hints,
     inspect::{inspect, sheet},
-    read::{ReadConfig, Turntable, cameras_with},
+    read::{Format, ReadConfig, Turntable, cameras_with},
 };
-use freerange_util::write_atomically;
+use freerange_util::{Stop, Stopped, write_atomically};
 use image::{GrayImage, ImageFormat, ImageReader, Luma, Rgba, RgbaImage};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use crate::{Engine, Limits, Refusal, Scene, error::chain, upload::all_inside};
+use crate::{Engine, Limits, Refusal, Scene, disk::size_of, error::chain, plain, upload::all_inside};
 
 /// How photos are read, as a client says it; everything may be left out.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -30,6 +30,8 @@ pub struct SceneOptions {
     pub invert_masks: bool,
     /// `auto`, `z`, `y` or `cameras`.
     pub up: Option<String>,
+    /// Name of the cameras' format, where a folder has several.
+    pub cameras: Option<String>,
     /// `ELEVATION,FOV` of photos of one even turn, which have no cameras.
     pub turntable: Option<String>,
 }
@@ -55,6 +57,13 @@ impl SceneOptions {
         })
     }
 
+    fn cameras(&self) -> Result<Option<Format>, Refusal> {
+        let Some(name) = self.cameras.as_deref().filter(|name| !["", "auto"].contains(name)) else { return Ok(None) };
+        let found = Format::ALL.into_iter().find(|f| f.name() == name);
+        let names = || Format::ALL.map(Format::name).join(", ");
+        found.map(Some).ok_or_else(|| Refusal::new(422, format!("cameras: expected auto, {}", names())))
+    }
+
     fn turntable(&self) -> Result<Option<Turntable>, Refusal> {
         let given = self.turntable.as_deref().filter(|t| !t.is_empty());
         given.map(|t| Turntable::from_str(t).map_err(|e| Refusal::new(422, format!("turntable: {e}")))).transpose()
@@ -62,7 +71,7 @@ impl SceneOptions {
 
     /// Refuses what cannot be used.
     pub fn check(&self) -> Result<(), Refusal> {
-        self.masks().and(self.up()).and(self.turntable()).map(drop)
+        self.masks().and(self.up()).and(self.cameras()).and(self.turntable()).map(drop)
     }
 }
 
@@ -103,12 +112,6 @@ pub fn is_whole(folder: &Path) -> bool {
     scene_file(folder).is_file()
 }
 
-fn sentence(upload: &Path, error: &(dyn std::error::Error + 'static)) -> Refusal {
-    // Where we put a client's files is nobody's business.
-    let folder = format!("{}/", upload.display());
-    Refusal::new(422, chain(error).replace(&folder, "").replace(&*upload.to_string_lossy(), "the folder"))
-}
-
 fn save(picture: &RgbaImage, path: &Path) -> Result<(), Refusal> {
     let file = fs::File::create(path).map_err(Refusal::own)?;
     // Fast rather than small: these files are read on the same machine.
@@ -120,53 +123,111 @@ fn save(picture: &RgbaImage, path: &Path) -> Result<(), Refusal> {
     picture.write_with_encoder(fast).map_err(Refusal::own)
 }
 
-/// Reads the photos in `upload`, and writes what is needed of them into `folder`. Returns what was understood: the report of `inspect`, with
-/// the camera of each view.
-pub fn prepare(
-    upload: &Path,
-    folder: &Path,
-    options: &SceneOptions,
-    limits: &Limits,
-    engine: &dyn Engine,
-) -> Result<Value, Refusal> {
-    let refused = |e: SceneError| sentence(upload, &e);
-    let root = root(upload).map_err(Refusal::own)?;
-    let cameras = ReadConfig { turntable: options.turntable()?, ..ReadConfig::default() };
-    let found = cameras_with(&root, &cameras).map_err(refused)?;
-    all_inside(
-        upload,
-        found.photos.iter().flat_map(|p| [Some(&p.image), p.mask.as_ref()]).flatten().chain(&found.files),
-    )?;
-    let photos = LoadConfig {
-        masks: options.masks()?,
-        invert_masks: options.invert_masks,
-        max_side: limits.side,
-        hints: Hints { others: engine.leave_one_out(), ..Hints::default() },
-    };
-    let config = SceneConfig { cameras, photos, up: options.up()? };
-    let freerange_scene::Scene { cameras, mut loaded, frame, notes } =
-        freerange_scene::Scene::load(found, &config).map_err(refused)?;
-    // What is only compared with has no use here.
-    loaded.further.clear();
-    let canonical = canonical_from_user(&loaded.views, &frame).map_err(|e: CameraError| sentence(upload, &e))?;
-    let shown = engine.choose(&loaded.views).map_err(|e| Refusal::new(422, e))?;
+/// Photos of a client, and what is made of them.
+pub struct Preparation<'a> {
+    /// Where the client's files are.
+    pub upload: &'a Path,
+    /// Where what is needed of them goes.
+    pub folder: &'a Path,
+    pub options: &'a SceneOptions,
+    pub limits: &'a Limits,
+    pub engine: &'a dyn Engine,
+    /// When to end early.
+    pub stop: &'a Stop,
+    /// Bytes that `folder` may have.
+    pub room: u64,
+}
+
+impl Preparation<'_> {
+    /// A reader's error in the page's words.
+    fn refused(&self, error: &SceneError) -> Refusal {
+        match error {
+            SceneError::Stopped(Stopped::Cancelled) => Refusal::new(409, "cancelled"),
+            SceneError::Stopped(Stopped::Late) => {
+                let most = self.limits.read_time.as_secs_f64();
+                Refusal::new(
+                    422,
+                    format!(
+                        "reading these photos took longer than {most} seconds, which is all it may: give fewer, or masks with them"
+                    ),
+                )
+            }
+            error => Refusal::new(422, plain::sentence(&chain(error), self.upload)),
+        }
+    }
+
+    fn check_stop(&self) -> Result<(), Refusal> {
+        self.stop.check().map_err(|e| self.refused(&e.into()))
+    }
+
+    /// Refuses what takes more room than there is.
+    fn check_room(&self) -> Result<(), Refusal> {
+        let [found, most] = [size_of(self.folder), self.room].map(|bytes| bytes.div_ceil(1 << 20));
+        match found <= most {
+            true => Ok(()),
+            false => Err(Refusal::new(
+                507,
+                format!(
+                    "photos and masks: expected at most {most} MB on disk, which is all there is room for, found {found} MB; remove some jobs"
+                ),
+            )),
+        }
+    }
+
+    fn read(&self) -> Result<freerange_scene::Scene, Refusal> {
+        let refused = |e: SceneError| self.refused(&e);
+        let root = root(self.upload).map_err(Refusal::own)?;
+        let options = self.options;
+        let cameras =
+            ReadConfig { turntable: options.turntable()?, format: options.cameras()?, ..ReadConfig::default() };
+        let found = cameras_with(&root, &cameras).map_err(refused)?;
+        all_inside(
+            self.upload,
+            found.photos.iter().flat_map(|p| [Some(&p.image), p.mask.as_ref()]).flatten().chain(&found.files),
+        )?;
+        let photos = LoadConfig {
+            masks: options.masks()?,
+            invert_masks: options.invert_masks,
+            max_side: self.limits.side,
+            hints: Hints { others: self.engine.leave_one_out(), ..Hints::default() },
+            memory: self.limits.memory,
+            whole_folder: Some(self.folder.to_path_buf()),
+            stop: self.stop.clone(),
+        };
+        let config = SceneConfig { cameras, photos, up: options.up()? };
+        let mut scene = freerange_scene::Scene::load(found, &config).map_err(refused)?;
+        // What is only compared with has no use here.
+        scene.loaded.further.clear();
+        Ok(scene)
+    }
+}
+
+/// Reads the photos of a client, and writes what is needed of them. Returns what was understood: the report of `inspect`, with the camera of
+/// each view.
+pub fn prepare(job: &Preparation<'_>) -> Result<Value, Refusal> {
+    let folder = job.folder;
+    let freerange_scene::Scene { cameras, loaded, frame, notes } = job.read()?;
+    job.check_room()?;
+    let canonical =
+        canonical_from_user(&loaded.views, &frame).map_err(|e: CameraError| job.refused(&SceneError::from(e)))?;
+    let shown = job.engine.choose(&loaded.views).map_err(|e| Refusal::new(422, plain::sentence(&e, job.upload)))?;
+    job.check_stop()?;
     let mut report = inspect(&cameras, &loaded, &notes, &canonical, &shown);
     report.files.clear();
-    save(&sheet(&loaded, &report), &sheet_file(folder))?;
+    job.check_stop()?;
     let mut kept = Kept { views: Vec::new(), frame };
-    for (k, (view, whole)) in loaded.views.iter().zip(&loaded.whole).enumerate() {
+    for (k, view) in loaded.views.iter().enumerate() {
+        job.check_stop()?;
         save(&view.image, &view_file(folder, k))?;
-        save(whole, &whole_file(folder, k))?;
         kept.views.push(KeptView { name: view.name.clone(), camera: view.camera });
     }
+    save(&sheet(&loaded, &report).map_err(|e| job.refused(&e))?, &sheet_file(folder))?;
+    job.check_room()?;
     let text = serde_json::to_vec(&kept).map_err(Refusal::own)?;
     write_atomically(&scene_file(folder), |w| std::io::Write::write_all(w, &text)).map_err(Refusal::own)?;
 
     let mut understood = serde_json::to_value(&report).map_err(Refusal::own)?;
-    // The page shows sentences; where we put a client's files is nobody's business.
-    let places =
-        [upload.to_path_buf(), fs::canonicalize(upload).unwrap_or_default()].map(|p| format!("{}/", p.display()));
-    let plain = |text: &str| places.iter().fold(text.to_owned(), |text, place| text.replace(place, ""));
+    let plain = |text: &str| plain::sentence(text, job.upload);
     understood["notes"] = report.notes.iter().map(|note| plain(note)).collect();
     understood["warnings"] = report.warnings.iter().map(|warning| plain(warning)).collect();
     understood["canonical_from_user"] =

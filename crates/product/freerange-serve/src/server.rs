@@ -56,21 +56,58 @@ impl Stopper {
     }
 }
 
+/// Connections beyond all others, for probes and Prometheus; and how long their heads may take.
+const RESERVED: u64 = 8;
+const RESERVED_TIME: Duration = Duration::from_secs(1);
+
 /// One of the connections that may be open at a time.
-struct Connection(Arc<Site>);
+struct Connection {
+    site: Arc<Site>,
+    /// Whether it is one of those for `/health` and `/metrics` alone.
+    reserved: bool,
+}
 
 impl Connection {
     fn take(site: &Arc<Site>) -> Option<Self> {
-        let place = Self(site.clone());
         let before = site.board.metrics.connections.fetch_add(1, Relaxed);
-        (before < site.board.limits().connections as u64).then_some(place)
+        let most = site.board.limits().connections as u64;
+        let place = Self { site: site.clone(), reserved: before >= most };
+        (before < most + RESERVED).then_some(place)
     }
 }
 
 impl Drop for Connection {
     fn drop(&mut self) {
-        self.0.board.metrics.connections.fetch_sub(1, Relaxed);
+        self.site.board.metrics.connections.fetch_sub(1, Relaxed);
     }
+}
+
+/// Answers the one request of a connection.
+fn talk(connection: &Connection, stream: TcpStream) {
+    let Connection { site, reserved } = connection;
+    let limits = site.board.limits();
+    let head = if *reserved { limits.head_time.min(RESERVED_TIME) } else { limits.head_time };
+    match Request::read(stream, Patience { head, whole: limits.request_time }) {
+        Ok(None) => {}
+        Ok(Some(request)) if *reserved && !["/health", "/metrics"].contains(&&*request.path) => {
+            turn_away(site, &request.into_stream());
+        }
+        Ok(Some(request)) => serve(site, request),
+        Err((stream, _)) if *reserved => turn_away(site, &stream),
+        Err((stream, refusal)) => {
+            site.board.metrics.answered(refusal.status);
+            refused(&refusal).send(stream, false, limits.answer_time);
+        }
+    }
+}
+
+/// In a moment there may be room.
+fn turn_away(site: &Site, stream: &TcpStream) {
+    site.board.metrics.turned_away.fetch_add(1, Relaxed);
+    // Nobody can make us wait.
+    let _ = stream.set_nonblocking(true);
+    let text = "HTTP/1.1 503 Service Unavailable\r\nRetry-After: 1\r\nContent-Length: 0\r\nConnection: close\r\n\r\n";
+    let _ = std::io::Write::write(&mut &*stream, text.as_bytes());
 }
 
 impl Server {
@@ -110,12 +147,16 @@ impl Server {
     /// If the system gives no threads.
     pub fn run(self) -> std::io::Result<()> {
         let board = &self.site.board;
-        let (reads, computes) = (board.clone(), board.clone());
         let named = |name: &str| thread::Builder::new().name(name.into());
-        let workers =
-            [named("photos").spawn(move || reads.read_all())?, named("jobs").spawn(move || computes.compute_all())?];
-        let limits = board.limits();
-        let patience = Patience { head: limits.head_time, whole: limits.request_time };
+        let (computes, empties) = (board.clone(), board.clone());
+        let mut workers = vec![
+            named("jobs").spawn(move || computes.compute_all())?,
+            named("bin").spawn(move || empties.empty_all())?,
+        ];
+        for _ in 0..board.limits().readers.max(1) {
+            let reads = board.clone();
+            workers.push(named("photos").spawn(move || reads.read_all())?);
+        }
         for stream in self.listener.incoming() {
             if self.ended.load(Relaxed) {
                 break;
@@ -126,29 +167,11 @@ impl Server {
                 continue;
             };
             let _ = stream.set_nodelay(true);
-            let connection = Connection::take(&self.site);
-            let full = connection.is_none();
-            if full {
-                board.metrics.turned_away.fetch_add(1, Relaxed);
-                // In a moment there may be room; nothing is read, so that nobody can make us wait.
-                let _ = stream.set_nonblocking(true);
-                let text = "HTTP/1.1 503 Service Unavailable\r\nRetry-After: 1\r\nContent-Length: 0\r\nConnection: close\r\n\r\n";
-                let _ = std::io::Write::write(&mut &stream, text.as_bytes());
+            let Some(connection) = Connection::take(&self.site) else {
+                turn_away(&self.site, &stream);
                 continue;
-            }
-            let site = self.site.clone();
-            let talk = move || {
-                let _connection = connection;
-                match Request::read(stream, patience) {
-                    Ok(None) => {}
-                    Ok(Some(request)) => serve(&site, request),
-                    Err((stream, refusal)) => {
-                        site.board.metrics.answered(refusal.status);
-                        refused(&refusal).send(stream, false);
-                    }
-                }
             };
-            if let Err(e) = named("connection").stack_size(STACK).spawn(talk) {
+            if let Err(e) = named("connection").stack_size(STACK).spawn(move || talk(&connection, stream)) {
                 tracing::error!("no thread for a connection: {e}");
             }
         }

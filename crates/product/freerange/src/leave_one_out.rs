@@ -3,9 +3,10 @@
 use std::ops::ControlFlow;
 
 use freerange_gaussians::Gaussians;
-use freerange_optim::{InitialFitConfig, initial_fit};
+use freerange_optim::{FitProgress, InitialFitConfig, initial_fit};
 use freerange_raster::RasterConfig;
 use freerange_scene::camera::{Camera, FrameConfig, View, Window};
+use freerange_util::Stop;
 use image::{Rgba, RgbaImage};
 use rayon::prelude::*;
 
@@ -16,11 +17,11 @@ use crate::{Error, error::Lift, to_canonical};
 ///
 /// # Errors
 /// A sentence, where the views do not show one object from different places, or a fit diverges.
-pub fn leave_one_out(views: &[View]) -> Result<Vec<RgbaImage>, String> {
-    shown(views).map_err(|e| e.to_string())
+pub fn leave_one_out(views: &[View], stop: &Stop) -> Result<Vec<RgbaImage>, String> {
+    shown(views, stop).map_err(|e| e.to_string())
 }
 
-fn shown(views: &[View]) -> Result<Vec<RgbaImage>, Error> {
+fn shown(views: &[View], stop: &Stop) -> Result<Vec<RgbaImage>, Error> {
     // Finer or longer fits mend no more (docs/research/experiments/masks.md).
     let config = InitialFitConfig { iterations: 150, gaussians: 2048, render_size: 128 };
     let (_, canonical) = to_canonical(views, &FrameConfig::default())?;
@@ -31,7 +32,11 @@ fn shown(views: &[View]) -> Result<Vec<RgbaImage>, Error> {
         .map(|i| {
             let others: Vec<View> =
                 framed.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, v)| v.clone()).collect();
-            let cloud = initial_fit(&others, &config, i as u64, |_| ControlFlow::Continue(())).lift()?;
+            let go_on = |_: &FitProgress<'_>| match stop.check() {
+                Ok(()) => ControlFlow::Continue(()),
+                Err(_) => ControlFlow::Break(()),
+            };
+            let cloud = initial_fit(&others, &config, i as u64, go_on).lift()?;
             picture(&cloud, &canonical[i].camera)
         })
         .collect()

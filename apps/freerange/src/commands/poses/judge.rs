@@ -8,6 +8,7 @@ use freerange_scene::{
     inspect::view_warnings,
     read::{Cameras, Intrinsics},
 };
+use freerange_util::Stop;
 use glam::{DMat3, DVec3};
 use serde::Serialize;
 
@@ -211,7 +212,7 @@ impl Judgement {
     }
 
     fn predict(&mut self, loaded: &Loaded) {
-        let shown = match leave_one_out(&loaded.views) {
+        let shown = match leave_one_out(&loaded.views, &Stop::default()) {
             Ok(shown) => shown,
             Err(e) => {
                 self.refused.push(format!("no picture of the object comes of these poses ({e})"));

@@ -3,11 +3,11 @@
 use super::mask::{enlarged, smooth};
 use super::odds::odds;
 use super::picture;
-use super::plane::Table;
 use super::shown::Shown;
 use super::{LARGE, Masks, Stage};
 use crate::SceneError;
 use crate::camera::{View, image_ops::resize_area};
+use freerange_util::Stop;
 use image::RgbaImage;
 use rayon::prelude::*;
 
@@ -19,7 +19,8 @@ pub(super) const OUTSIDE_HULL: f32 = 1.0;
 
 /// Shows each view as all the others have it, by whatever makes a shape of views: straight color and alpha, in the order and size of the
 /// views, whose alpha is the masks as they are so far. Or says why not.
-pub type LeaveOneOut = fn(&[View]) -> Result<Vec<RgbaImage>, String>;
+/// It ends early, by an error, when it is stopped.
+pub type LeaveOneOut = fn(&[View], &Stop) -> Result<Vec<RgbaImage>, String>;
 
 impl Stage {
     /// Each view as the others have it, on a larger picture.
@@ -39,7 +40,7 @@ impl Stage {
                 view
             })
             .collect();
-        let shown = show(&cut_out)?;
+        let shown = show(&cut_out, &self.stop)?;
         let fits = |(image, view): (&RgbaImage, &View)| image.dimensions() == view.image.dimensions();
         match shown.len() == views.len() && shown.iter().zip(&cut_out).all(fits) {
             true => Ok(shown),
@@ -52,7 +53,7 @@ impl Stage {
         let count = self.pictures.len();
         let near: Vec<Vec<f32>> = (0..count).map(|i| self.nearness(i)).collect();
         let background = self.background(&last.masks);
-        let tables: Vec<Option<Table>> = (0..count).map(|i| self.table(&background, i)).collect();
+        let tables = self.tables(&background)?;
         let (object, behind) = self.colors(&near, &tables, Some(last))?;
         let shown: Vec<[Shown; 2]> = (0..count)
             .map(|i| {
@@ -71,12 +72,13 @@ impl Stage {
         let masks: Vec<Vec<bool>> = (0..count)
             .into_par_iter()
             .map(|i| {
+                self.stop.check()?;
                 let [shown, _] = &shown[i];
                 let odds = odds(&self.pictures[i], &object, &behind, tables[i].as_ref(), Some(shown), |_| true);
                 let outside = |k: usize| if last.outlines[i][k] { 0.0 } else { OUTSIDE_HULL };
-                self.cut(i, &near[i], &odds, Some(&last.outlines[i]), |k| odds[k] + shown.odds(k) - outside(k))
+                Ok(self.cut(i, &near[i], &odds, Some(&last.outlines[i]), |k| odds[k] + shown.odds(k) - outside(k)))
             })
-            .collect();
+            .collect::<Result<_, SceneError>>()?;
         let outlines = self.outlines(&masks).ok_or_else(|| SceneError::NotCutOut {
             reason: "no point of space lies within all masks once they are refined with what other views show".into(),
         })?;

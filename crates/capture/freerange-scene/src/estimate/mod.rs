@@ -19,20 +19,23 @@ mod odds;
 mod picture;
 mod place;
 mod plane;
+mod sharpen;
 mod shown;
 
 pub use confirm::confirmed;
 pub use evidence::{Compared, Evidence};
 pub use hull::overlap;
 pub use leave_one_out::LeaveOneOut;
+pub(crate) use sharpen::memory;
 
 use crate::SceneError;
 use crate::camera::View;
+use freerange_util::Stop;
 use glam::{DVec3, Vec3};
 use hull::{Floor, Hull, reaches_border};
 use image::RgbaImage;
-use leave_one_out::{LEAST_VIEWS, OUTSIDE_HULL, ROUNDS};
-use mask::{enlarged, grown, shrunk, smooth, soft, tidy};
+use leave_one_out::{LEAST_VIEWS, ROUNDS};
+use mask::{grown, smooth, soft, tidy};
 use mixture::Mixture;
 use odds::{cut, odds};
 use picture::Picture;
@@ -123,7 +126,12 @@ const LEAST_AGREEMENT: f64 = 0.7;
 
 /// Finds the object's masks. The views' own alpha only says what they show (corners of undistorted photos are empty).
 pub fn masks(views: &[View], hints: &Hints) -> Result<Estimate, SceneError> {
-    let found = unjudged(views, hints)?;
+    masks_until(views, hints, &Stop::default())
+}
+
+/// [`masks`], unless it is stopped.
+pub(crate) fn masks_until(views: &[View], hints: &Hints, stop: &Stop) -> Result<Estimate, SceneError> {
+    let found = search(views, hints, stop)?;
     match found.contradiction(views) {
         Some(reason) => Err(SceneError::NotCutOut { reason }),
         None => Ok(found),
@@ -133,11 +141,15 @@ pub fn masks(views: &[View], hints: &Hints) -> Result<Estimate, SceneError> {
 /// [`masks`] also where the views contradict each other. For tests.
 #[doc(hidden)]
 pub fn unjudged(views: &[View], hints: &Hints) -> Result<Estimate, SceneError> {
+    search(views, hints, &Stop::default())
+}
+
+fn search(views: &[View], hints: &Hints, stop: &Stop) -> Result<Estimate, SceneError> {
     let refuse = |reason: String| Err(SceneError::NotCutOut { reason });
     if views.len() < 3 {
         return refuse(format!("expected at least 3 views, found {}", views.len()));
     }
-    let stage = Stage::new(views, hints)?;
+    let stage = Stage::new(views, hints, stop)?;
     let mut notes = Vec::new();
     match &stage.plane {
         Some(plane) => notes.push(format!(
@@ -151,9 +163,11 @@ pub fn unjudged(views: &[View], hints: &Hints) -> Result<Estimate, SceneError> {
     let evidence = stage.evidence(&small);
     if let Some(others) = hints.others.filter(|_| views.len() >= LEAST_VIEWS) {
         for _ in 0..ROUNDS {
+            stop.check()?;
             match stage.shown_by_others(views, &small, others) {
                 Ok(shown) => small = stage.refine(&small, shown)?,
                 Err(reason) => {
+                    stop.check()?;
                     notes.push(format!("masks are not refined with what other views show: {reason}"));
                     break;
                 }
@@ -161,6 +175,7 @@ pub fn unjudged(views: &[View], hints: &Hints) -> Result<Estimate, SceneError> {
         }
     }
     let large = stage.sharpen(views, &small)?;
+    stop.check()?;
     let hull = Hull::carve(&large.pictures, &large.masks, stage.center, 1.3 * stage.radius, stage.floor(), 0, FINE);
     let agreement: Vec<f64> = match &hull {
         Some(hull) => large.pictures.iter().zip(&large.masks).map(|(p, m)| overlap(&hull.outline(p), m)).collect(),
@@ -192,6 +207,7 @@ struct Stage {
     plane: Option<Plane>,
     /// The plane on which the views agree best, whether it stands out or not.
     best: Option<Plane>,
+    stop: Stop,
 }
 
 /// Masks in the making.
@@ -207,14 +223,8 @@ struct Masks {
     shown: Vec<[Shown; 2]>,
 }
 
-/// Masks on larger pictures.
-struct Sharp {
-    pictures: Vec<Picture>,
-    masks: Vec<Vec<bool>>,
-}
-
 impl Stage {
-    fn new(views: &[View], hints: &Hints) -> Result<Self, SceneError> {
+    fn new(views: &[View], hints: &Hints, stop: &Stop) -> Result<Self, SceneError> {
         let pictures: Vec<Picture> = views.par_iter().map(|v| Picture::of(v, SMALL)).collect();
         let Some(center) = hints.center.or_else(|| meeting_point(views)) else {
             let reason = "the cameras do not look at one common point; if the poses are right, say where the object is (--center X,Y,Z)";
@@ -226,10 +236,11 @@ impl Stage {
                 "the point that the cameras look at is not in the photos; say where the object is (--center X,Y,Z)";
             return Err(SceneError::NotCutOut { reason: reason.into() });
         };
-        let mut stage = Self { pictures, center, radius, distance, plane: None, best: None };
+        let mut stage = Self { pictures, center, radius, distance, plane: None, best: None, stop: stop.clone() };
         let object: Vec<Vec<bool>> =
             (0..views.len()).map(|i| stage.nearness(i).iter().map(|d| *d < 0.6).collect()).collect();
-        let found = plane::find(&stage.pictures, &object, center, mean_up(views), distance);
+        let found = plane::find(&stage.pictures, &object, center, mean_up(views), distance, stop);
+        stop.check()?;
         stage.plane = found.filter(|(_, stands_out)| *stands_out).map(|(plane, _)| plane);
         stage.best = found.map(|(plane, _)| plane);
         Ok(stage)
@@ -257,6 +268,14 @@ impl Stage {
         Some(plane::table(&self.pictures, background, i, self.center, plane, self.distance, |_| true))
     }
 
+    fn tables(&self, background: &[Vec<f32>]) -> Result<Vec<Option<Table>>, SceneError> {
+        let one = |i| {
+            self.stop.check()?;
+            Ok(self.table(background, i))
+        };
+        (0..self.pictures.len()).map(one).collect()
+    }
+
     /// Cuts all views in turns until their masks stay as they are.
     fn take_turns(&self) -> Result<Masks, SceneError> {
         let count = self.pictures.len();
@@ -265,11 +284,12 @@ impl Stage {
             near.iter().map(|n| n.iter().map(|d| ((d - UNSEEN) / (SEEN - UNSEEN)).clamp(0.0, 1.0)).collect()).collect();
         let mut last: Option<Masks> = None;
         for _ in 0..TURNS {
-            let tables: Vec<Option<Table>> = (0..count).map(|i| self.table(&background, i)).collect();
+            let tables = self.tables(&background)?;
             let (object, behind) = self.colors(&near, &tables, last.as_ref())?;
             let cut: Vec<(Vec<bool>, f64)> = (0..count)
                 .into_par_iter()
                 .map(|i| {
+                    self.stop.check()?;
                     let odds = odds(&self.pictures[i], &object, &behind, tables[i].as_ref(), None, |_| true);
                     let biased = |k: usize| match &last {
                         Some(last) if last.outlines[i][k] => odds[k] + INSIDE,
@@ -281,9 +301,9 @@ impl Stage {
                     let (right, all) = about.fold((0usize, 0usize), |(right, all), k| {
                         (right + usize::from(mask[k] == (odds[k] > 0.0)), all + 1)
                     });
-                    (mask, right as f64 / all.max(1) as f64)
+                    Ok((mask, right as f64 / all.max(1) as f64))
                 })
-                .collect();
+                .collect::<Result<_, SceneError>>()?;
             let (masks, clearness): (Vec<Vec<bool>>, Vec<f64>) = cut.into_iter().unzip();
             let outlines = self.outlines(&masks).ok_or_else(|| SceneError::NotCutOut {
                 reason:
@@ -382,51 +402,6 @@ impl Stage {
             }),
         }
     }
-
-    /// Cuts the outlines again on larger pictures.
-    fn sharpen(&self, views: &[View], small: &Masks) -> Result<Sharp, SceneError> {
-        let pictures: Vec<Picture> = views.par_iter().map(|v| Picture::of(v, LARGE)).collect();
-        let shares: Vec<Vec<f32>> = (0..views.len())
-            .map(|i| {
-                let (from, to) = (&self.pictures[i], &pictures[i]);
-                let mask: Vec<f32> = small.masks[i].iter().map(|m| f32::from(u8::from(*m))).collect();
-                enlarged(&mask, from.width(), from.height(), to.width(), to.height())
-            })
-            .collect();
-        let background: Vec<Vec<f32>> =
-            shares.iter().map(|s| s.iter().map(|v| (1.0 - v).clamp(0.03, 1.0)).collect()).collect();
-        let masks = (0..views.len())
-            .map(|i| {
-                let picture = &pictures[i];
-                let (w, h) = (picture.width(), picture.height());
-                let rough: Vec<bool> = shares[i].iter().map(|s| *s > 0.5).collect();
-                let outer = grown(&rough, w, h, 8);
-                let inner = shrunk(&rough, w, h, 8);
-                let open = |k: usize| outer[k] && !inner[k];
-                let table = self
-                    .plane
-                    .as_ref()
-                    .map(|plane| plane::table(&pictures, &background, i, self.center, plane, self.distance, open));
-                let shown = small.shown.get(i).map(|[_, large]| large);
-                let odds = odds(picture, &small.object, &small.background, table.as_ref(), shown, open);
-                let outline: Vec<f32> = small.outlines[i].iter().map(|m| f32::from(u8::from(*m))).collect();
-                let from = &self.pictures[i];
-                let outline = enlarged(&outline, from.width(), from.height(), w, h);
-                let outline: Vec<bool> = outline.iter().map(|o| *o > 0.5).collect();
-                let mut biased = odds.clone();
-                for (k, o) in biased.iter_mut().enumerate() {
-                    *o += match shown {
-                        Some(shown) => shown.odds(k) - if outline[k] { 0.0 } else { OUTSIDE_HULL },
-                        None if outline[k] => INSIDE,
-                        None => -OUTSIDE,
-                    };
-                }
-                let mask = cut(picture, &biased, Some((&inner, &outer)));
-                tidy(&mask, &odds, Some(&outline), picture)
-            })
-            .collect();
-        Ok(Sharp { pictures, masks })
-    }
 }
 
 /// Every so manyth color, so that about `count` are left.
@@ -460,8 +435,8 @@ pub fn contradictions(views: &[View], center: DVec3, radius: f64) -> Vec<f64> {
 }
 
 /// The direction in which the plane faces that the object stands on, where one stands out. `views`: the object cut out; `whole`: the
-/// photos with what is around it, in the same order.
-pub fn table_faces(views: &[View], whole: &[RgbaImage]) -> Option<DVec3> {
+/// photos with what is around it, by number.
+pub fn table_faces(views: &[View], whole: impl Fn(usize) -> Option<RgbaImage> + Sync) -> Option<DVec3> {
     let center = meeting_point(views).filter(|_| views.len() >= 3)?;
     let distance = views.iter().map(|v| v.camera.center().distance(center)).sum::<f64>() / views.len() as f64;
     let object: Vec<Vec<bool>> = views
@@ -473,9 +448,9 @@ pub fn table_faces(views: &[View], whole: &[RgbaImage]) -> Option<DVec3> {
         .collect();
     let pictures: Vec<Picture> = views
         .par_iter()
-        .zip(whole)
-        .map(|(v, image)| Picture::of(&View { name: String::new(), camera: v.camera, image: image.clone() }, SMALL))
-        .collect();
-    let (plane, stands_out) = plane::find(&pictures, &object, center, mean_up(views), distance)?;
+        .enumerate()
+        .map(|(k, v)| Some(Picture::of(&View { name: String::new(), camera: v.camera, image: whole(k)? }, SMALL)))
+        .collect::<Option<_>>()?;
+    let (plane, stands_out) = plane::find(&pictures, &object, center, mean_up(views), distance, &Stop::default())?;
     stands_out.then_some(plane.normal)
 }

@@ -54,6 +54,12 @@ impl Picture {
         Self { camera, lab, smooth, valid, alike }
     }
 
+    /// What other pictures are compared with: without its own colors and edges.
+    pub fn to_compare(mut self) -> Self {
+        (self.lab, self.alike) = (Vec::new(), Vec::new());
+        self
+    }
+
     pub fn width(&self) -> usize {
         self.camera.width as usize
     }

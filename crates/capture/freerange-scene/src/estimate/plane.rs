@@ -5,6 +5,7 @@
 //! would show without the object, from the views that see past it.
 
 use super::picture::{Picture, bilinear};
+use freerange_util::Stop;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
@@ -38,10 +39,12 @@ pub fn find(
     center: DVec3,
     up: DVec3,
     distance: f64,
+    stop: &Stop,
 ) -> Option<(Plane, bool)> {
     let (a, b) = across(up);
     let normal = |tilt: [f64; 2]| (up + tilt[0] * a + tilt[1] * b).normalize();
     let score = |p: [f64; 3], grid: usize| {
+        stop.check().ok()?;
         disagreement(pictures, object, center, normal([p[0], p[1]]), p[2] * distance, 0.7 * distance, grid)
     };
     // Farther away little of a plane is seen, and that little may agree by chance: of walls, for one.

@@ -1,6 +1,6 @@
 //! Views without what is around the object: by mask files, alpha, a plain backdrop, a network, or poses and colors.
 
-use super::{LoadConfig, MaskKind, MaskSource};
+use super::{LoadConfig, MaskKind, MaskSource, memory};
 use crate::camera::{View, scene::cut_out};
 use crate::{
     SceneError,
@@ -80,7 +80,8 @@ fn mask_all(
     {
         return Ok((kind, None));
     }
-    let estimate = estimate::masks(views, &config.hints)?;
+    memory::check_estimate(views, config)?;
+    let estimate = estimate::masks_until(views, &config.hints, &config.stop)?;
     for (view, alpha) in views.iter_mut().zip(&estimate.alpha) {
         set_alpha(&mut view.image, alpha);
     }
@@ -130,6 +131,7 @@ fn by_alpha_or_backdrop(
         .par_iter()
         .zip(told)
         .map(|(view, picture)| match (picture.alpha, &config.masks) {
+            _ if config.stop.check().is_err() => config.stop.check().map(|()| None).map_err(SceneError::from),
             (true, MaskSource::Auto | MaskSource::Alpha) => Ok(None),
             (false, MaskSource::Alpha) => Err(SceneError::Mask {
                 name: view.name.clone(),
@@ -152,6 +154,7 @@ fn by_alpha_or_backdrop(
             }
             Ok(Some(if cut == views.len() { MaskKind::Plain } else { MaskKind::Alpha }))
         }
+        Err(error @ SceneError::Stopped(_)) => Err(error),
         Err(error) if config.masks != MaskSource::Auto || with_alpha > 0 => Err(error),
         Err(_) => Ok(None),
     }

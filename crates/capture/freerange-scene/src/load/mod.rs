@@ -4,9 +4,12 @@ mod aim;
 mod cut;
 mod mask_image;
 mod masks;
+mod memory;
 mod picture;
+mod whole;
 
 pub use cut::cut;
+pub use whole::Whole;
 
 use crate::camera::{
     Lens, Up, View,
@@ -23,21 +26,18 @@ use crate::{
 };
 use aim::Aim;
 use cut::{Told, cut_all, plain, set_alpha};
-use freerange_util::{Invalid, IoError, Note, beside, persist};
-use image::{GrayImage, Luma, RgbaImage};
+use freerange_util::{IoError, Note, Stop, beside, persist};
+use image::{GrayImage, Luma};
 use mask_image::{colored, gray};
 use masks::{MaskFiles, Meaning, mask_files, meaning};
 use picture::{Picture, picture};
 use rayon::prelude::*;
 use std::{
+    borrow::Cow,
     collections::{BTreeSet, HashSet},
     path::{Path, PathBuf},
 };
 
-/// All views of a scene together, in pixels (4 bytes each).
-const LARGEST_SCENE: u64 = 1 << 30;
-/// Photos that are decoded at once, in pixels, but for one: some 8 bytes each.
-const LARGEST_AT_ONCE: u64 = 1 << 28;
 /// What a rim of nothing leaves of a photo at least.
 const RIM_FILL: f64 = 0.6;
 
@@ -87,11 +87,26 @@ pub struct LoadConfig {
     pub max_side: u32,
     /// What is known of the object's place, for [`MaskSource::Estimate`].
     pub hints: Hints,
+    /// Most bytes that photos, masks and what masks are estimated with take at a time. Checked from the files' heads before anything is
+    /// decoded, and again before masks are estimated.
+    pub memory: u64,
+    /// Folder that whole photos are written to ([`Whole::Files`]) instead of being held.
+    pub whole_folder: Option<PathBuf>,
+    /// When reading has to end early.
+    pub stop: Stop,
 }
 
 impl Default for LoadConfig {
     fn default() -> Self {
-        Self { masks: MaskSource::Auto, invert_masks: false, max_side: 1024, hints: Hints::default() }
+        Self {
+            masks: MaskSource::Auto,
+            invert_masks: false,
+            max_side: 1024,
+            hints: Hints::default(),
+            memory: 16 << 30,
+            whole_folder: None,
+            stop: Stop::default(),
+        }
     }
 }
 
@@ -103,7 +118,7 @@ pub struct Loaded {
     /// Which of [`Cameras::photos`] each view is.
     pub photos: Vec<usize>,
     /// The whole photo of each view, undistorted.
-    pub whole: Vec<RgbaImage>,
+    pub whole: Whole,
     /// Further views, only compared with.
     pub further: Vec<View>,
     /// How the object was told from the rest.
@@ -129,7 +144,7 @@ pub fn load(cameras: &Cameras, config: &LoadConfig) -> Result<Loaded, SceneError
     let mut notes = Vec::new();
     let masks = mask_files(cameras, config, &mut notes)?;
     let aim = Aim::of(cameras, &masks.of, config)?;
-    check_pixels(cameras, config)?;
+    memory::check_photos(cameras, &masks.of, config)?;
     let mut pictures = pictures_of(cameras, &inputs, &masks, aim.as_ref(), config)?;
     tell(&pictures, cameras, &inputs, &mut notes);
     let usable = look_at_masks(cameras, &mut pictures, &masks, config, &mut notes)?;
@@ -146,7 +161,7 @@ pub fn load(cameras: &Cameras, config: &LoadConfig) -> Result<Loaded, SceneError
         .zip(pictures)
         .map(|(i, p)| View { name: names[*i].clone(), camera: p.camera, image: p.image })
         .collect();
-    let whole: Vec<RgbaImage> = views.iter().map(|v| v.image.clone()).collect();
+    let whole = Whole::of(&views, config)?;
     let first = views[0].camera.center();
     if views.iter().all(|v| v.camera.center().distance(first) <= 1e-6 * (1e-6 + first.length())) {
         let found = format!("all {} cameras stand at one point; expected views from different places", views.len());
@@ -162,23 +177,7 @@ pub fn load(cameras: &Cameras, config: &LoadConfig) -> Result<Loaded, SceneError
     Ok(Loaded { views, photos: inputs, whole, further, masks: kind, estimate, notes })
 }
 
-/// Refuses photos, those that are only compared with among them, that together are larger than a scene may be; before any of
-/// them is decoded.
-fn check_pixels(cameras: &Cameras, config: &LoadConfig) -> Result<(), SceneError> {
-    let mut pixels = 0;
-    for photo in &cameras.photos {
-        let (w, h) = shrunk_size(size_of(&photo.image)?, config.max_side);
-        pixels += u64::from(w) * u64::from(h);
-    }
-    if pixels <= LARGEST_SCENE {
-        return Ok(());
-    }
-    let expected =
-        format!("photos of at most {LARGEST_SCENE} pixels together; fewer of them, or a smaller --max-resolution");
-    Err(Invalid::new("--max-resolution", expected, pixels).into())
-}
-
-/// The photos of `which`: as many at once as their whole files fit into [`LARGEST_AT_ONCE`].
+/// The photos of `which`: as many at once as [`memory::at_once`] allows.
 fn pictures_of(
     cameras: &Cameras,
     which: &[usize],
@@ -193,13 +192,16 @@ fn pictures_of(
         while count < rest.len() {
             let (w, h) = size_of(&cameras.photos[rest[count]].image)?;
             pixels += u64::from(w) * u64::from(h);
-            if count > 0 && pixels > LARGEST_AT_ONCE {
+            if count > 0 && pixels > memory::at_once(config) {
                 break;
             }
             count += 1;
         }
         let (now, later) = rest.split_at(count);
-        let one = |i: &usize| picture(&cameras.photos[*i], masks.of[*i].as_deref(), aim, config);
+        let one = |i: &usize| {
+            config.stop.check()?;
+            picture(&cameras.photos[*i], masks.of[*i].as_deref(), aim, config)
+        };
         all.extend(first_error(now.par_iter().map(one).collect())?);
         rest = later;
     }
@@ -444,7 +446,7 @@ pub fn up_of(cameras: &Cameras, loaded: &Loaded) -> (Up, Option<Note>) {
     }
     let table = match &loaded.estimate {
         Some(estimate) => estimate.up,
-        None => estimate::table_faces(&loaded.views, &loaded.whole),
+        None => estimate::table_faces(&loaded.views, |k| loaded.whole.get(k).ok().map(Cow::into_owned)),
     };
     let whence = if table.is_some() { "what the object stands on" } else { "the cameras" };
     let note = Note::assumed(format!("up is taken from {whence}; --up says otherwise"));

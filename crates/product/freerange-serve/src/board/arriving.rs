@@ -8,12 +8,24 @@ use std::{
 
 use serde_json::Value;
 
-use super::{Board, clear, table::Job, uploads};
+use super::{Board, table::Job, uploads};
 use crate::{
     JobOptions, Refusal,
     record::{Record, State},
     scene::SceneOptions,
 };
+
+/// What a client has sent.
+pub struct Submission {
+    pub title: String,
+    pub scene: SceneOptions,
+    /// Computed as soon as it is read.
+    pub go: Option<JobOptions>,
+    /// Files of no use.
+    pub passed_over: Vec<String>,
+    /// Bytes on disk.
+    pub bytes: u64,
+}
 
 /// A job whose files are on their way; it is gone unless it is submitted.
 pub struct Arriving<'b> {
@@ -27,24 +39,19 @@ pub struct Arriving<'b> {
 impl Drop for Arriving<'_> {
     fn drop(&mut self) {
         if !self.submitted {
-            let job = self.board.table().jobs.remove(&self.id);
-            job.into_iter().for_each(|job| clear(&job.folder));
+            let mut table = self.board.table();
+            self.board.forget(&mut table, &self.id);
         }
     }
 }
 
 impl Arriving<'_> {
     /// Everything is there: it may be read.
-    pub fn submit(
-        mut self,
-        title: String,
-        scene: SceneOptions,
-        go: Option<JobOptions>,
-        passed_over: Vec<String>,
-    ) -> Result<String, Refusal> {
+    pub fn submit(mut self, submission: Submission) -> Result<String, Refusal> {
+        let Submission { title, scene, go, passed_over, bytes } = submission;
         self.board.change(&self.id, |job| {
             (job.record.title, job.record.scene, job.record.passed_over) = (title, scene, passed_over);
-            (job.record.state, job.go) = (State::Reading, go);
+            (job.record.state, job.go, job.bytes) = (State::Reading, go, bytes);
             Ok(())
         })?;
         self.submitted = true;
@@ -53,17 +60,19 @@ impl Arriving<'_> {
 }
 
 impl Board {
-    /// Makes room for a new job.
-    pub fn arrive(&self) -> Result<Arriving<'_>, Refusal> {
+    /// Makes room for a new job of so many bytes.
+    pub fn arrive(&self, bytes: u64) -> Result<Arriving<'_>, Refusal> {
         let mut table = self.table();
         if table.jobs.values().filter(|j| j.record.state.is_open()).count() >= self.limits.open_jobs {
             // One that nobody came back to makes way.
-            let idle = |j: &&Job| j.record.state == State::Ready && j.touched.elapsed() > self.limits.idle_time;
+            let idle = |j: &&Job| {
+                j.record.state == State::Ready && j.touched.elapsed() > self.limits.idle_time && j.is_still()
+            };
             let oldest = table.jobs.values().filter(idle).min_by_key(|j| j.touched).map(|j| j.record.id.clone());
             let full = || {
                 Refusal::new(429, format!("{} jobs are open, which is all there is room for", self.limits.open_jobs))
             };
-            table.forget(&oldest.ok_or_else(full)?);
+            self.forget(&mut table, &oldest.ok_or_else(full)?);
         }
         let finished = |j: &&Job| !j.record.state.is_open();
         while table.jobs.values().filter(finished).count() >= self.limits.finished_jobs {
@@ -74,19 +83,21 @@ impl Board {
                 );
                 return Err(Refusal::new(507, text));
             }
-            let oldest = table.jobs.values().filter(finished).min_by_key(|j| j.touched).map(|j| j.record.id.clone());
-            oldest.iter().for_each(|id| table.forget(id));
+            match Self::oldest_finished(&table) {
+                Some(id) => self.forget(&mut table, &id),
+                None => break,
+            }
         }
+        self.make_room(&mut table, bytes)?;
         let id = loop {
             let id = format!("{:016x}", rand::random::<u64>());
-            if !table.jobs.contains_key(&id) {
+            if !table.jobs.contains_key(&id) && !table.removed.contains_key(&id) {
                 break id;
             }
         };
         let folder = self.root.join(&id);
         // Masks are also looked for some folders above the photos: there has to be nothing else.
         let upload = uploads(&folder).join("0/0/0");
-        fs::create_dir_all(&upload).map_err(Refusal::own)?;
         table.turns += 1;
         let record = Record {
             id: id.clone(),
@@ -104,9 +115,13 @@ impl Board {
             notes: Vec::new(),
             seconds: Vec::new(),
         };
-        let job = table.job(record, folder);
+        let mut job = table.job(record, folder);
+        job.bytes = bytes;
         table.jobs.insert(id.clone(), job);
-        Ok(Arriving { board: self, id, upload, submitted: false })
+        drop(table);
+        let arriving = Arriving { board: self, id, upload, submitted: false };
+        fs::create_dir_all(&arriving.upload).map_err(Refusal::own)?;
+        Ok(arriving)
     }
 }
 

@@ -2,8 +2,11 @@
 
 use std::sync::{Arc, PoisonError, atomic::Ordering::Relaxed};
 
-use super::{Board, clear, no_such, table::Progress, uploads};
+use super::{Board, no_such, table::Progress, uploads};
 use crate::{JobOptions, Refusal, record::State, scene};
+
+/// Most characters of a title.
+const TITLE: usize = 120;
 
 impl Board {
     /// Lets a job compute.
@@ -40,6 +43,8 @@ impl Board {
         let mut unread = None;
         self.change(id, |job| {
             match job.record.state {
+                // Whoever reads it ends at the next photo, and clears its files away.
+                State::Reading if job.read_by_one => {}
                 State::Reading => unread = Some(uploads(&job.folder)),
                 State::Queued | State::Running => {}
                 state => return Err(Refusal::new(409, format!("this job is {}", state.name()))),
@@ -50,21 +55,20 @@ impl Board {
             self.metrics.ended(State::Cancelled.name());
             Ok(())
         })?;
-        // Nobody reads these photos any more, unless someone is at it: then what comes of it is not looked at.
-        unread.iter().for_each(|folder| clear(folder));
+        unread.into_iter().for_each(|folder| self.doom(folder));
         Ok(())
     }
 
-    /// Forgets a job, and what lies on disk of it.
-    pub fn remove(&self, id: &str) -> Result<(), Refusal> {
-        let mut table = self.table();
-        let job = table.jobs.get(id).ok_or_else(no_such)?;
-        if matches!(job.record.state, State::Uploading | State::Reading | State::Running) {
-            return Err(Refusal::new(409, format!("this job is {}: cancel it first", job.record.state.name())));
+    /// Gives a job another title.
+    pub fn rename(&self, id: &str, title: &str) -> Result<(), Refusal> {
+        let title = title.trim();
+        if title.is_empty() || title.chars().count() > TITLE || title.chars().any(char::is_control) {
+            return Err(Refusal::new(422, format!("title: expected 1 to {TITLE} characters in one line")));
         }
-        table.forget(id);
-        self.changed.notify_all();
-        Ok(())
+        self.change(id, |job| {
+            job.record.title = title.to_owned();
+            Ok(())
+        })
     }
 
     /// Gives a photo another mask.

@@ -7,20 +7,11 @@ use std::{
     time::{Duration, Instant},
 };
 
-use freerange_gaussians::formats::{Format, Frame, WriteOptions};
-use freerange_gaussians::read_ply;
-use glam::DVec3;
+use freerange_gaussians::formats::Format;
 use serde_json::{Value, json};
 
-use super::{
-    Board, no_such,
-    table::{Job, bytes},
-};
-use crate::{
-    Refusal,
-    record::{State, sample_file},
-    scene,
-};
+use super::{Board, no_such, table::Job};
+use crate::{Refusal, record::State, scene};
 
 impl Board {
     /// What is known of a job, for clients.
@@ -106,38 +97,5 @@ impl Board {
             estimate.ok_or_else(|| Refusal::new(gone, "this estimate is not there: there are later ones"))?;
         let part = estimate.parts.iter().find(|(s, _)| *s == sample);
         part.map(|(_, rows)| rows.clone()).ok_or_else(|| Refusal::new(404, "this estimate has no such sample"))
-    }
-
-    /// Sample `i` of a result as a file.
-    pub fn result(&self, id: &str, i: usize, format: Format) -> Result<(Vec<u8>, String), Refusal> {
-        let (folder, up, state) = {
-            let table = self.table();
-            let job = table.jobs.get(id).ok_or_else(no_such)?;
-            if i >= job.record.samples.len() {
-                return Err(Refusal::new(404, "this job has no such sample"));
-            }
-            (job.folder.clone(), job.record.up, job.record.title.clone())
-        };
-        let splats = read_ply(&sample_file(&folder, i)).map_err(Refusal::own)?.splats;
-        let frame = Frame::with_up(DVec3::from_array(up)).unwrap_or_default();
-        let options = WriteOptions { frame, ..WriteOptions::default() };
-        let encoded = freerange_gaussians::formats::encode(&splats, format, &options).map_err(Refusal::own)?;
-        // Nothing of a client's name may end the header or name a folder.
-        let plain: String = state.chars().filter(|c| c.is_ascii_alphanumeric() || "-_".contains(*c)).take(40).collect();
-        let plain = if plain.is_empty() { "gaussians".to_owned() } else { plain };
-        Ok((encoded.bytes, format!("{plain}-{i}.{format}")))
-    }
-
-    /// Rows of the Gaussians of sample `i` of a result.
-    pub fn rows(&self, id: &str, i: usize) -> Result<Vec<u8>, Refusal> {
-        let folder = {
-            let table = self.table();
-            let job = table.jobs.get(id).ok_or_else(no_such)?;
-            if i >= job.record.samples.len() {
-                return Err(Refusal::new(404, "this job has no such sample"));
-            }
-            job.folder.clone()
-        };
-        Ok(bytes(&read_ply(&sample_file(&folder, i)).map_err(Refusal::own)?.splats.cloud))
     }
 }

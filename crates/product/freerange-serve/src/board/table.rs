@@ -3,14 +3,13 @@
 use std::{
     collections::{BTreeMap, VecDeque},
     path::PathBuf,
-    sync::{Arc, atomic::AtomicBool},
+    sync::{Arc, Mutex, atomic::AtomicBool},
     time::Instant,
 };
 
 use freerange_gaussians::Gaussians;
 use serde_json::{Value, json};
 
-use super::clear;
 use crate::{
     JobOptions,
     record::{Record, State},
@@ -45,11 +44,19 @@ pub(super) struct Job {
     pub(super) touched: Instant,
     /// Computed as soon as it is read.
     pub(super) go: Option<JobOptions>,
+    /// Whether a thread reads its photos.
+    pub(super) read_by_one: bool,
+    /// Bytes on disk.
+    pub(super) bytes: u64,
+    /// Held by whoever changes its record.
+    pub(super) writing: Arc<Mutex<()>>,
 }
 
 #[derive(Default)]
 pub(super) struct Table {
     pub(super) jobs: BTreeMap<String, Job>,
+    /// Those that can be brought back.
+    pub(super) removed: BTreeMap<String, Job>,
     pub(super) turns: u64,
     pub(super) versions: u64,
 }
@@ -71,6 +78,9 @@ impl Table {
             cancel: Arc::default(),
             touched: Instant::now(),
             go: None,
+            read_by_one: false,
+            bytes: 0,
+            writing: Arc::default(),
         }
     }
 
@@ -82,13 +92,17 @@ impl Table {
         turns
     }
 
-    pub(super) fn forget(&mut self, id: &str) {
-        let job = self.jobs.remove(id);
-        job.into_iter().for_each(|job| clear(&job.folder));
+    pub(super) fn disk(&self) -> u64 {
+        self.jobs.values().chain(self.removed.values()).map(|j| j.bytes).sum()
     }
 }
 
 impl Job {
+    /// Whether nobody is changing it.
+    pub(super) fn is_still(&self) -> bool {
+        self.writing.try_lock().is_ok()
+    }
+
     /// What changes while it is on its way.
     pub(super) fn status(&self, waiting: &[u64]) -> Value {
         let (r, p) = (&self.record, &self.progress);

@@ -1,4 +1,4 @@
-//! The threads that read photos and compute.
+//! The thread that computes.
 
 use std::{
     fs,
@@ -19,12 +19,15 @@ use freerange_scene::camera::{
 use image::RgbaImage;
 
 use super::{
-    Board, clear, no_such,
-    table::{Estimate, Job, Progress, bytes},
-    uploads,
+    Board,
+    results::forget_edits,
+    table::{Estimate, Progress, bytes},
 };
 use crate::{
     EngineError, JobOptions, Outcome, Refusal, Step,
+    disk::size_of,
+    engine::MOST_SAMPLES,
+    plain,
     record::{SampleRecord, State, sample_file, thumbnail_file},
     scene,
 };
@@ -39,14 +42,14 @@ const ESTIMATES: usize = 8;
 const THUMBNAIL: u32 = 160;
 
 impl Board {
-    /// The next job in `state`; none when the server ends.
-    fn next(&self, state: State) -> Option<String> {
+    /// The next job to compute; none when the server ends.
+    fn next_queued(&self) -> Option<String> {
         let mut table = self.table();
         loop {
             if self.stopping.load(Relaxed) {
                 return None;
             }
-            let of = table.jobs.values().filter(|j| j.record.state == state);
+            let of = table.jobs.values().filter(|j| j.record.state == State::Queued);
             if let Some(job) = of.min_by_key(|j| (j.record.turn, j.record.created)) {
                 return Some(job.record.id.clone());
             }
@@ -54,58 +57,9 @@ impl Board {
         }
     }
 
-    /// Reads photos, one job after the other, until the server ends.
-    pub fn read_all(&self) {
-        while let Some(id) = self.next(State::Reading) {
-            let Ok((folder, options, cancel)) =
-                self.with(&id, |j| (j.folder.clone(), j.record.scene.clone(), j.cancel.clone()))
-            else {
-                continue;
-            };
-            let upload = uploads(&folder).join("0/0/0");
-            let work = || {
-                let understood = scene::prepare(&upload, &folder, &options, &self.limits, &*self.engine)?;
-                let first = image::open(scene::view_file(&folder, 0)).map_err(Refusal::own)?.into_rgba8();
-                save_thumbnail(&folder, &on_white(&first))?;
-                Ok(understood)
-            };
-            let read = guarded(work);
-            clear(&uploads(&folder));
-            let turn = {
-                let mut table = self.table();
-                table.turns += 1;
-                table.turns
-            };
-            let told = self.change(&id, |job| {
-                if cancel.load(Relaxed) || job.record.state != State::Reading {
-                    // Someone was faster; what was read is there all the same.
-                    if let Ok(understood) = read {
-                        job.record.understood = understood;
-                    }
-                    return Ok(());
-                }
-                match read {
-                    Ok(understood) => {
-                        job.record.understood = understood;
-                        job.record.state = State::Ready;
-                        if let Some(options) = job.go.take() {
-                            (job.record.state, job.record.options, job.record.turn) = (State::Queued, options, turn);
-                        }
-                    }
-                    Err(e) => {
-                        (job.record.state, job.record.error) = (State::Failed, Some(e.text));
-                        self.metrics.ended(State::Failed.name());
-                    }
-                }
-                Ok(())
-            });
-            self.note(told);
-        }
-    }
-
     /// Computes, one job after the other, until the server ends.
     pub fn compute_all(&self) {
-        while let Some(id) = self.next(State::Queued) {
+        while let Some(id) = self.next_queued() {
             let started = self.change(&id, |job| {
                 if job.record.state != State::Queued {
                     return Err(Refusal::new(409, ""));
@@ -119,11 +73,13 @@ impl Board {
             let spent = begin.elapsed();
             self.metrics.milliseconds.fetch_add(u64::try_from(spent.as_millis()).unwrap_or(u64::MAX), Relaxed);
             let stopping = self.stopping.load(Relaxed);
+            let bytes = size_of(&folder);
             let told = self.change(&id, |job| {
                 // Cancelled, and perhaps asked to go again since: the flag is this run's own.
                 if job.record.state != State::Running || !Arc::ptr_eq(&job.cancel, &cancel) {
                     return Ok(());
                 }
+                job.bytes = bytes;
                 let r = &mut job.record;
                 match outcome {
                     Ok(outcome) => {
@@ -147,6 +103,7 @@ impl Board {
                 Ok(())
             });
             self.note(told);
+            self.trim();
         }
     }
 
@@ -190,12 +147,13 @@ impl Board {
                 ));
             }
             (Err(EngineError::Cancelled), _) => return Err(Refusal::new(409, "cancelled")),
-            (Err(EngineError::Input(e)), _) => return Err(Refusal::new(422, e)),
+            (Err(EngineError::Input(e)), _) => return Err(Refusal::new(422, plain::sentence(&e, folder))),
             (Err(EngineError::Failed(e)), _) => return Err(Refusal::own(e)),
         };
         if cancel.load(Relaxed) {
             return Err(Refusal::new(409, "cancelled"));
         }
+        forget_edits(folder, MOST_SAMPLES);
         for (i, (_, cloud)) in outcome.samples.iter().enumerate() {
             write_ply(cloud, &sample_file(folder, i)).map_err(Refusal::own)?;
         }
@@ -233,11 +191,7 @@ impl Board {
         self.changed.notify_all();
     }
 
-    fn with<T>(&self, id: &str, f: impl FnOnce(&Job) -> T) -> Result<T, Refusal> {
-        self.table().jobs.get(id).map(f).ok_or_else(no_such)
-    }
-
-    fn note(&self, told: Result<(), Refusal>) {
+    pub(super) fn note(&self, told: Result<(), Refusal>) {
         if let Err(e) = told
             && e.status != 404
         {
@@ -247,11 +201,11 @@ impl Board {
 }
 
 /// Runs what might panic: a job may fail, the server must not.
-fn guarded<T>(work: impl FnOnce() -> Result<T, Refusal>) -> Result<T, Refusal> {
+pub(super) fn guarded<T>(work: impl FnOnce() -> Result<T, Refusal>) -> Result<T, Refusal> {
     std::panic::catch_unwind(std::panic::AssertUnwindSafe(work)).unwrap_or_else(|_| Err(Refusal::own("a job panicked")))
 }
 
-fn on_white(image: &RgbaImage) -> RgbaImage {
+pub(super) fn on_white(image: &RgbaImage) -> RgbaImage {
     to_picture(&composite(image, [1.0; 3]), image.width(), image.height())
 }
 
@@ -261,7 +215,7 @@ fn small(width: u32, height: u32) -> (u32, u32) {
     (side(width), side(height))
 }
 
-fn save_thumbnail(folder: &Path, picture: &RgbaImage) -> Result<(), Refusal> {
+pub(super) fn save_thumbnail(folder: &Path, picture: &RgbaImage) -> Result<(), Refusal> {
     let (w, h) = small(picture.width(), picture.height());
     let beside = folder.join("thumbnail.new.png");
     resize_area(picture, w, h).save(&beside).map_err(Refusal::own)?;

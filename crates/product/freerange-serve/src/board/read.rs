@@ -1,0 +1,116 @@
+//! The threads that read photos.
+
+use std::{
+    path::PathBuf,
+    sync::{Arc, PoisonError, atomic::AtomicBool, atomic::Ordering::Relaxed},
+    time::Instant,
+};
+
+use freerange_util::Stop;
+use rayon::ThreadPoolBuilder;
+use serde_json::Value;
+
+use super::{
+    Board, clear, uploads,
+    work::{guarded, on_white, save_thumbnail},
+};
+use crate::{
+    Refusal,
+    disk::size_of,
+    record::State,
+    scene::{self, Preparation, SceneOptions},
+};
+
+/// A job whose photos a thread reads.
+struct Unread {
+    id: String,
+    folder: PathBuf,
+    options: SceneOptions,
+    cancel: Arc<AtomicBool>,
+}
+
+impl Board {
+    /// The next job whose photos nobody reads yet; none when the server ends.
+    fn next_unread(&self) -> Option<Unread> {
+        let mut table = self.table();
+        loop {
+            if self.stopping.load(Relaxed) {
+                return None;
+            }
+            let of = table.jobs.values_mut().filter(|j| j.record.state == State::Reading && !j.read_by_one);
+            if let Some(job) = of.min_by_key(|j| (j.record.turn, j.record.created)) {
+                job.read_by_one = true;
+                return Some(Unread {
+                    id: job.record.id.clone(),
+                    folder: job.folder.clone(),
+                    options: job.record.scene.clone(),
+                    cancel: job.cancel.clone(),
+                });
+            }
+            table = self.changed.wait(table).unwrap_or_else(PoisonError::into_inner);
+        }
+    }
+
+    /// Reads photos, one job after the other, until the server ends. Several threads do so at the same time.
+    pub fn read_all(&self) {
+        // Threads of its own: in a common pool, pictures of a small job would wait behind all those of a large one.
+        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        let own = ThreadPoolBuilder::new().num_threads(cores.div_ceil(self.limits.readers.max(1))).build();
+        let pool = match own {
+            Ok(pool) => pool,
+            Err(e) => return tracing::error!("no threads to read photos: {e}"),
+        };
+        while let Some(unread) = self.next_unread() {
+            let read = pool.install(|| guarded(|| self.read(&unread)));
+            let Unread { id, folder, cancel, .. } = unread;
+            clear(&uploads(&folder));
+            let bytes = size_of(&folder);
+            let told = self.change(&id, |job| {
+                (job.read_by_one, job.bytes) = (false, bytes);
+                if cancel.load(Relaxed) || job.record.state != State::Reading {
+                    // Someone was faster; what was read is there all the same.
+                    if let Ok(understood) = read {
+                        job.record.understood = understood;
+                    }
+                    return Ok(());
+                }
+                match read {
+                    Ok(understood) => {
+                        job.record.understood = understood;
+                        job.record.state = State::Ready;
+                        if let Some(options) = job.go.take() {
+                            // Its turn is that of its arrival, however long it took to read.
+                            (job.record.state, job.record.options) = (State::Queued, options);
+                        }
+                    }
+                    Err(e) => {
+                        (job.record.state, job.record.error) = (State::Failed, Some(e.text));
+                        self.metrics.ended(State::Failed.name());
+                    }
+                }
+                Ok(())
+            });
+            self.note(told);
+            self.trim();
+        }
+    }
+
+    /// Reads the photos of one job; ends early when it is cancelled, and when its time is over.
+    fn read(&self, unread: &Unread) -> Result<Value, Refusal> {
+        let Unread { id, folder, options, cancel } = unread;
+        let stop = Stop::on(cancel.clone(), Some(Instant::now() + self.limits.read_time));
+        let upload = uploads(folder).join("0/0/0");
+        let understood = scene::prepare(&Preparation {
+            upload: &upload,
+            folder,
+            options,
+            limits: &self.limits,
+            engine: &*self.engine,
+            stop: &stop,
+            room: self.room(id),
+        })?;
+        let first = image::open(scene::view_file(folder, 0)).map_err(Refusal::own)?.into_rgba8();
+        save_thumbnail(folder, &on_white(&first))?;
+        Ok(understood)
+    }
+}

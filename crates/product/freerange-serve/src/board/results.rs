@@ -1,0 +1,124 @@
+//! Results: as files of all formats, as rows, and with some of their Gaussians left out.
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    sync::PoisonError,
+};
+
+use freerange_gaussians::formats::{Format, Frame, WriteOptions, encode};
+use freerange_gaussians::{read_ply, write_ply};
+use freerange_util::write_atomically;
+use glam::DVec3;
+
+use super::{Board, no_such, table::bytes};
+use crate::{
+    Refusal,
+    record::{State, sample_file},
+};
+
+/// The Gaussians that the run made, where some of them were left out since.
+fn whole_file(folder: &Path, i: usize) -> PathBuf {
+    folder.join(format!("sample-{i}-whole.ply"))
+}
+
+/// Which of those are kept: a byte for each, 0 or 1.
+fn kept_file(folder: &Path, i: usize) -> PathBuf {
+    folder.join(format!("sample-{i}-kept.bin"))
+}
+
+/// Forgets what was left out of earlier results.
+pub(super) fn forget_edits(folder: &Path, samples: usize) {
+    for i in 0..samples {
+        for file in [whole_file(folder, i), kept_file(folder, i)] {
+            if let Err(e) = fs::remove_file(&file)
+                && e.kind() != std::io::ErrorKind::NotFound
+            {
+                tracing::warn!("{}: {e}", file.display());
+            }
+        }
+    }
+}
+
+impl Board {
+    /// The folder, up and title of a job that has a sample `i`.
+    fn with_sample(&self, id: &str, i: usize) -> Result<(PathBuf, [f64; 3], String), Refusal> {
+        let table = self.table();
+        let job = table.jobs.get(id).ok_or_else(no_such)?;
+        if i >= job.record.samples.len() {
+            return Err(Refusal::new(404, "this job has no such sample"));
+        }
+        Ok((job.folder.clone(), job.record.up, job.record.title.clone()))
+    }
+
+    /// Sample `i` of a result as a file.
+    pub fn result(&self, id: &str, i: usize, format: Format) -> Result<(Vec<u8>, String), Refusal> {
+        let (folder, up, title) = self.with_sample(id, i)?;
+        let splats = read_ply(&sample_file(&folder, i)).map_err(Refusal::own)?.splats;
+        let frame = Frame::with_up(DVec3::from_array(up)).unwrap_or_default();
+        let options = WriteOptions { frame, ..WriteOptions::default() };
+        let encoded = encode(&splats, format, &options).map_err(Refusal::own)?;
+        // Nothing of a client's name may end the header or name a folder.
+        let plain: String = title.chars().filter(|c| c.is_ascii_alphanumeric() || "-_".contains(*c)).take(40).collect();
+        let plain = if plain.is_empty() { "gaussians".to_owned() } else { plain };
+        Ok((encoded.bytes, format!("{plain}-{i}.{format}")))
+    }
+
+    /// Rows of the Gaussians of sample `i` of a result.
+    pub fn rows(&self, id: &str, i: usize) -> Result<Vec<u8>, Refusal> {
+        let (folder, ..) = self.with_sample(id, i)?;
+        Ok(bytes(&read_ply(&sample_file(&folder, i)).map_err(Refusal::own)?.splats.cloud))
+    }
+
+    /// Rows of all Gaussians that the run made of sample `i`.
+    pub fn whole_rows(&self, id: &str, i: usize) -> Result<Vec<u8>, Refusal> {
+        let (folder, ..) = self.with_sample(id, i)?;
+        let whole = Some(whole_file(&folder, i)).filter(|file| file.is_file());
+        let file = whole.unwrap_or_else(|| sample_file(&folder, i));
+        Ok(bytes(&read_ply(&file).map_err(Refusal::own)?.splats.cloud))
+    }
+
+    /// Which Gaussians of [`Self::whole_rows`] are kept: a byte for each.
+    pub fn kept(&self, id: &str, i: usize) -> Result<Vec<u8>, Refusal> {
+        let (folder, ..) = self.with_sample(id, i)?;
+        match fs::read(kept_file(&folder, i)) {
+            Ok(kept) => Ok(kept),
+            Err(_) => {
+                let cloud = read_ply(&sample_file(&folder, i)).map_err(Refusal::own)?.splats.cloud;
+                Ok(vec![1; cloud.len()])
+            }
+        }
+    }
+
+    /// Keeps some of the Gaussians that the run made of sample `i`: a byte for each, 0 or 1. Files of all formats follow. Returns their number.
+    pub fn keep(&self, id: &str, i: usize, kept: &[u8]) -> Result<usize, Refusal> {
+        let _one = self.editing.lock().unwrap_or_else(PoisonError::into_inner);
+        let (folder, ..) = self.with_sample(id, i)?;
+        let busy = self.table().jobs.get(id).map(|j| j.record.state).filter(|state| *state != State::Done);
+        if let Some(state) = busy {
+            return Err(Refusal::new(409, format!("this job is {}: its result cannot be changed now", state.name())));
+        }
+        let (shown, whole) = (sample_file(&folder, i), whole_file(&folder, i));
+        let from = if whole.is_file() { &whole } else { &shown };
+        let cloud = read_ply(from).map_err(Refusal::own)?.splats.cloud;
+        if kept.len() != cloud.len() || kept.iter().any(|v| *v > 1) {
+            let text = format!("body: expected {} bytes, each 0 or 1, found {} bytes", cloud.len(), kept.len());
+            return Err(Refusal::new(422, text));
+        }
+        let chosen = cloud.select((0..kept.len()).filter(|k| kept[*k] == 1));
+        if chosen.is_empty() {
+            return Err(Refusal::new(422, "body: expected some Gaussians that are kept, found none"));
+        }
+        if !whole.is_file() {
+            write_ply(&cloud, &whole).map_err(Refusal::own)?;
+        }
+        write_atomically(&kept_file(&folder, i), |w| std::io::Write::write_all(w, kept)).map_err(Refusal::own)?;
+        write_ply(&chosen, &shown).map_err(Refusal::own)?;
+        self.change(id, |job| {
+            if let Some(sample) = job.record.samples.get_mut(i) {
+                sample.gaussians = chosen.len();
+            }
+            Ok(chosen.len())
+        })
+    }
+}

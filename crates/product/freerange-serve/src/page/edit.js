@@ -1,0 +1,152 @@
+// Parts of a result left out: what lies outside of a box, and what floats apart from the object. Each step is saved, and can be undone.
+import { attempt, box, button, call, get, input, make } from "./dom.js";
+import { app, viewed } from "./state.js";
+
+const CHANNELS = 14;
+/** Voxels along the longest side of the object, to see what hangs together. */
+const GRID = 48;
+/** Parts with a smaller share of the Gaussians are floaters. */
+const SHARE = 0.02;
+
+/**
+ * @typedef {{id: string, sample: number, rows: Float32Array, kept: Uint8Array, low: number[], high: number[], before: Uint8Array[]}} Edit
+ * @type {?Edit}
+ */
+let edit = null;
+
+/** @param {string} path */
+const bytes = async (path) => {
+  const response = await fetch(path, { credentials: "same-origin" });
+  if (!response.ok) throw new Error(`${path}: ${response.status}`);
+  return response.arrayBuffer();
+};
+
+const ends = () => [0, 1, 2].map((axis) => [Number(input(`from-${axis}`).value) / 100, Number(input(`to-${axis}`).value) / 100]);
+
+/**
+ * Which Gaussians are kept and lie in the box.
+ * @param {Edit} of
+ */
+const inside = ({ rows, kept, low, high }) => {
+  const limits = ends().map(([from, to], axis) => [low[axis] + from * (high[axis] - low[axis]), low[axis] + to * (high[axis] - low[axis])]);
+  return kept.map((v, i) => (v && limits.every(([from, to], axis) => rows[i * CHANNELS + axis] >= from && rows[i * CHANNELS + axis] <= to) ? 1 : 0));
+};
+
+/** @param {Uint8Array} mask */
+const show = (mask) => {
+  const pane = edit && app.panes[edit.sample];
+  if (!edit || !pane) return;
+  const count = mask.reduce((sum, v) => sum + v, 0), chosen = new Float32Array(count * CHANNELS);
+  let to = 0;
+  mask.forEach((v, i) => {
+    if (v && edit) chosen.set(edit.rows.subarray(i * CHANNELS, (i + 1) * CHANNELS), CHANNELS * to++);
+  });
+  pane.viewer.setGaussians(chosen);
+  box("edit-text").textContent = `${count.toLocaleString("en")} of ${mask.length.toLocaleString("en")} Gaussians`;
+  button("edit-undo").disabled = edit.before.length === 0;
+};
+
+const whole = () => [0, 1, 2].forEach((axis) => {
+  input(`from-${axis}`).value = "0";
+  input(`to-${axis}`).value = "100";
+});
+
+/** @param {number} sample */
+const begin = async (sample) => {
+  const { job } = app;
+  edit = null;
+  if (!job || job.state !== "done") return;
+  const path = `/jobs/${job.id}/samples/${sample}`;
+  const [rows, kept] = await Promise.all([bytes(`${path}/whole`), bytes(`${path}/kept`)]);
+  if (app.job?.id !== job.id) return;
+  const data = new Float32Array(rows), low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
+  for (let i = 0; i < data.length; i += CHANNELS) {
+    for (let axis = 0; axis < 3; axis++) {
+      low[axis] = Math.min(low[axis], data[i + axis]);
+      high[axis] = Math.max(high[axis], data[i + axis]);
+    }
+  }
+  edit = { id: job.id, sample, rows: data, kept: new Uint8Array(kept), low, high, before: [] };
+  whole();
+  show(edit.kept);
+};
+
+/**
+ * Saves what is kept; files of all formats follow.
+ * @param {Uint8Array} kept
+ * @param {boolean} undoes
+ */
+const save = async (kept, undoes = false) => {
+  if (!edit) return;
+  const { gaussians } = await call("PUT", `/jobs/${edit.id}/samples/${edit.sample}/kept`, new Blob([new Uint8Array(kept)]));
+  if (!undoes) edit.before.push(edit.kept);
+  edit.kept = kept;
+  whole();
+  show(kept);
+  const pane = app.panes[edit.sample], sample = app.job?.samples[edit.sample];
+  if (pane && sample) pane.caption.textContent = `seed ${sample.seed}, ${gaussians.toLocaleString("en")} Gaussians`;
+  viewed.dispatchEvent(new Event("viewed"));
+};
+
+/**
+ * Gaussians of parts that hang together with few others, or none, are left out.
+ * @param {Edit} of
+ */
+const tidy = ({ rows, kept, low, high }) => {
+  const step = Math.max(...high.map((v, axis) => v - low[axis])) / GRID || 1, side = GRID + 3;
+  /** @type {Map<number, number[]>} */
+  const cells = new Map();
+  kept.forEach((v, i) => {
+    if (!v) return;
+    const at = [0, 1, 2].reduce((sum, axis) => sum * side + 1 + Math.floor((rows[i * CHANNELS + axis] - low[axis]) / step), 0), cell = cells.get(at);
+    if (cell) cell.push(i);
+    else cells.set(at, [i]);
+  });
+  const steps = [-1, 0, 1].flatMap((x) => [-1, 0, 1].flatMap((y) => [-1, 0, 1].map((z) => (x * side + y) * side + z)));
+  /** @type {number[][]} */
+  const parts = [], seen = new Set();
+  for (const start of cells.keys()) {
+    if (seen.has(start)) continue;
+    seen.add(start);
+    const open = [start];
+    /** @type {number[]} */
+    const part = [];
+    for (let at = open.pop(); at !== undefined; at = open.pop()) {
+      part.push(...cells.get(at) ?? []);
+      for (const next of steps.map((d) => d + /** @type {number} */ (at))) {
+        if (!cells.has(next) || seen.has(next)) continue;
+        seen.add(next);
+        open.push(next);
+      }
+    }
+    parts.push(part);
+  }
+  const count = parts.reduce((sum, part) => sum + part.length, 0), most = Math.max(...parts.map((part) => part.length)), result = kept.slice();
+  for (const part of parts) {
+    if (part.length < most && part.length < SHARE * count) part.forEach((i) => { result[i] = 0; });
+  }
+  return result;
+};
+
+/** Offers to edit the job's samples. */
+export const offerEdit = () => {
+  const { job } = app, select = get("edit-sample", HTMLSelectElement);
+  edit = null;
+  get("edit", HTMLDetailsElement).open = false;
+  select.replaceChildren(...(job?.samples ?? []).map((sample, i) => make("option", { value: String(i) }, `seed ${sample.seed}`)));
+  box("edit-which").hidden = select.options.length < 2;
+};
+const start = () => void attempt(() => begin(Number(get("edit-sample", HTMLSelectElement).value)));
+get("edit", HTMLDetailsElement).addEventListener("toggle", (e) => {
+  if (e.target instanceof HTMLDetailsElement && e.target.open) start();
+  else if (edit) show(edit.kept);
+});
+get("edit-sample", HTMLSelectElement).addEventListener("change", start);
+for (const axis of [0, 1, 2]) for (const end of ["from", "to"]) input(`${end}-${axis}`).addEventListener("input", () => { if (edit) show(inside(edit)); });
+button("edit-crop").addEventListener("click", () => void attempt(async () => { if (edit) await save(inside(edit)); }));
+button("edit-tidy").addEventListener("click", () => void attempt(async () => { if (edit) await save(tidy(edit)); }));
+button("edit-all").addEventListener("click", () => void attempt(async () => { if (edit) await save(edit.kept.map(() => 1)); }));
+button("edit-undo").addEventListener("click", () => void attempt(async () => {
+  const last = edit?.before.pop();
+  if (last) await save(last, true);
+}));

@@ -1,0 +1,166 @@
+// All jobs: which one is shown, hearing of it, starting, cancelling, renaming, removing it.
+/**
+ * @typedef {import("./state.js").Status} Status
+ */
+import { attempt, box, button, call, get, input, make, select } from "./dom.js";
+import { estimates } from "./gaussians.js";
+import { hooks, showJob, showStatus } from "./job.js";
+import { look, showPanes } from "./panes.js";
+import { app } from "./state.js";
+
+/** Time between two tries for a stream of events, where all of the server's are taken. */
+const AGAIN = 3000;
+/** @type {?EventSource} */
+let source = null;
+
+/** @param {string} id */
+const reload = async (id) => {
+  const found = await call("GET", `/jobs/${id}`);
+  if (location.hash !== `#job=${id}`) return;
+  const wasHere = app.job?.id === id;
+  app.job = found;
+  if (!wasHere) {
+    showPanes(0, found.understood);
+    look(null);
+  }
+  showJob();
+  void estimates();
+  await listJobs();
+};
+
+hooks.edited = async () => {
+  if (app.job) await reload(app.job.id);
+  if (app.looking !== null) look(app.looking);
+};
+
+/** @param {string} id */
+const listen = (id) => {
+  const stream = new EventSource(`/jobs/${id}/events`);
+  source = stream;
+  stream.addEventListener("job", (e) => {
+    /** @type {Status} */
+    const status = JSON.parse(e.data);
+    if (!app.job || app.job.id !== id || source !== stream) return;
+    const changed = status.state !== app.job.state;
+    if (changed && status.state === "queued") app.drawn = 0;
+    Object.assign(app.job, status);
+    showStatus(app.job);
+    void estimates();
+    if (changed) void attempt(() => reload(id));
+  });
+  stream.addEventListener("gone", () => stream.close());
+  // A stream that ends is opened again by the browser; one that is refused is not.
+  stream.addEventListener("error", () => {
+    if (stream.readyState !== EventSource.CLOSED || source !== stream) return;
+    setTimeout(() => {
+      if (source !== stream) return;
+      void attempt(() => reload(id));
+      listen(id);
+    }, AGAIN);
+  });
+};
+
+/** Shows the job that the address names, and hears of it from now on. */
+export const open = async () => {
+  const id = /^#job=([0-9a-f]{16})$/.exec(location.hash)?.[1];
+  source?.close();
+  source = null;
+  app.drawn = 0;
+  if (!id) {
+    app.job = null;
+    showJob();
+    return listJobs();
+  }
+  try {
+    await reload(id);
+  } catch (error) {
+    app.job = null;
+    showJob();
+    await listJobs();
+    throw error;
+  }
+  listen(id);
+};
+window.addEventListener("hashchange", () => void attempt(open));
+
+const listJobs = async () => {
+  /** @type {Status[]} */
+  const all = await call("GET", "/jobs");
+  box("no-jobs").hidden = all.length > 0;
+  box("jobs").replaceChildren(...all.map((s) => {
+    const seen = !["reading", "failed", "interrupted"].includes(s.state) || s.id === app.job?.id;
+    const picture = make("img", { alt: "", loading: "lazy", width: "64", height: "64" });
+    if (seen) picture.src = `/jobs/${s.id}/thumbnail.png?v=${s.state}`;
+    const link = make("a", { href: `#job=${s.id}`, ...(s.id === app.job?.id ? { "aria-current": "true" } : {}) }, picture,
+      make("span", {}, make("b", {}, s.title || s.id), make("span", { class: "small" }, `${s.state}, ${new Date(1000 * s.created).toLocaleString()}`)));
+    return make("li", {}, link);
+  }));
+};
+
+get("go-form", HTMLFormElement).addEventListener("submit", (e) => {
+  e.preventDefault();
+  void attempt(async () => {
+    if (!app.job) return;
+    const quality = select("quality").value, init = select("init").value, iterations = input("iterations").value;
+    const options = { samples: Number(input("samples").value), seed: Number(input("seed").value), ...(quality ? { quality } : {}), ...(init ? { init } : {}), ...(iterations === "" ? {} : { iterations: Number(iterations) }) };
+    app.drawn = 0;
+    document.body.dataset.estimates = "0";
+    delete document.body.dataset.result;
+    await call("POST", `/jobs/${app.job.id}/go`, JSON.stringify(options));
+  });
+});
+button("cancel").addEventListener("click", () => void attempt(async () => {
+  if (!app.job) return;
+  await call("POST", `/jobs/${app.job.id}/cancel`);
+  // This button is gone now.
+  box("job-title").focus();
+}));
+
+// --- Rename, remove, undo ------------------------------------------------------------------------------------------------
+
+const renaming = get("rename-dialog", HTMLDialogElement), removing = get("remove-dialog", HTMLDialogElement);
+button("rename").addEventListener("click", () => {
+  input("new-title").value = app.job?.title ?? "";
+  renaming.showModal();
+  input("new-title").select();
+});
+get("rename-form", HTMLFormElement).addEventListener("submit", (e) => {
+  e.preventDefault();
+  renaming.close();
+  void attempt(async () => {
+    if (!app.job) return;
+    await call("PUT", `/jobs/${app.job.id}/title`, JSON.stringify({ title: input("new-title").value }));
+    await reload(app.job.id);
+  });
+});
+button("rename-close").addEventListener("click", () => renaming.close());
+
+button("remove").addEventListener("click", () => {
+  box("remove-title").textContent = `Remove ${app.job?.title || "this object"}?`;
+  removing.showModal();
+});
+button("remove-no").addEventListener("click", () => removing.close());
+/** @type {?string} */
+let removed = null;
+button("remove-yes").addEventListener("click", () => void attempt(async () => {
+  removing.close();
+  if (!app.job) return;
+  const { id, title } = app.job;
+  source?.close();
+  source = null;
+  await call("DELETE", `/jobs/${id}`);
+  removed = id;
+  box("removed-text").textContent = `${title || "The object"} was removed.`;
+  box("removed").hidden = false;
+  // The focused button is gone: what one may want next has the focus.
+  button("undo").focus();
+  location.hash = "";
+}));
+button("undo").addEventListener("click", () => void attempt(async () => {
+  if (!removed) return;
+  await call("POST", `/jobs/${removed}/restore`);
+  box("removed").hidden = true;
+  location.hash = `job=${removed}`;
+  removed = null;
+  box("main").focus();
+}));

@@ -1,0 +1,18 @@
+// The page of `freerange serve`.
+import { attempt, box, call } from "./dom.js";
+import { open } from "./jobs.js";
+import "./record.js";
+import { offerExample, tellLimits } from "./send.js";
+import { app } from "./state.js";
+
+// What followed a link of another site has one mark more in its address.
+if (location.search) history.replaceState(null, "", `/${location.hash}`);
+
+void attempt(async () => {
+  const about = await call("GET", "/server");
+  app.limits = about.limits;
+  tellLimits();
+  if (about.example) offerExample(about.example);
+  await open();
+  box("engine").textContent = about.engine;
+});

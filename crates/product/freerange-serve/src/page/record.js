@@ -1,0 +1,83 @@
+// Pictures and films of the result: a screenshot, a turntable, the whole screen, turning by itself.
+import { attempt, box, button, complain, save, toolbar } from "./dom.js";
+import { app } from "./state.js";
+
+/** Seconds of a whole turn, by itself and as a film. */
+const TURN = 12, FILM = 6;
+const KINDS = ["video/webm;codecs=vp9", "video/webm;codecs=vp8", "video/webm"];
+
+const title = () => (app.job?.title ?? "").replace(/[^\w-]+/g, "-").replace(/^-+|-+$/g, "") || "gaussians";
+
+/** @type {number | undefined} */
+let turning;
+/** @param {boolean} on */
+const turn = (on) => {
+  if (turning !== undefined) cancelAnimationFrame(turning);
+  turning = undefined;
+  button("auto").setAttribute("aria-pressed", String(on));
+  let last = performance.now();
+  const step = () => {
+    const now = performance.now(), viewer = app.panes[0]?.viewer;
+    if (!viewer) return turn(false);
+    viewer.turn(2 * Math.PI * (now - last) / 1000 / TURN, 0);
+    last = now;
+    turning = requestAnimationFrame(step);
+  };
+  if (on) turning = requestAnimationFrame(step);
+};
+button("auto").addEventListener("click", () => turn(turning === undefined));
+
+button("full").addEventListener("click", () => void attempt(async () => {
+  if (document.fullscreenElement) await document.exitFullscreen();
+  else await box("views").requestFullscreen();
+}));
+document.addEventListener("fullscreenchange", () => app.panes.forEach((pane) => pane.viewer.redraw()));
+
+button("shot").addEventListener("click", () => void attempt(async () => {
+  for (const [i, { viewer }] of app.panes.entries()) {
+    viewer.draw(); // a picture lasts until its task ends
+    const blob = await new Promise((/** @type {(b: ?Blob) => void} */ done) => viewer.canvas.toBlob(done));
+    if (blob) save(blob, `${title()}-${i}.png`);
+  }
+}));
+
+/** One turn of the first view, as the browser records it. */
+const film = async () => {
+  const viewer = app.panes[0]?.viewer, mimeType = KINDS.find((kind) => MediaRecorder.isTypeSupported(kind));
+  if (!viewer || !mimeType) throw new Error("this browser records no WebM");
+  turn(false);
+  const record = button("film"), before = record.textContent;
+  record.disabled = true;
+  try {
+    const recorder = new MediaRecorder(viewer.canvas.captureStream(30), { mimeType, videoBitsPerSecond: 8e6 });
+    /** @type {Blob[]} */
+    const parts = [];
+    recorder.addEventListener("dataavailable", (e) => parts.push(e.data));
+    const ended = new Promise((done) => recorder.addEventListener("stop", done));
+    recorder.start();
+    const begin = performance.now();
+    let at = 0;
+    while (at < 1) {
+      await new Promise(requestAnimationFrame);
+      const now = Math.min(1, (performance.now() - begin) / 1000 / FILM);
+      viewer.turn(2 * Math.PI * (now - at), 0);
+      at = now;
+      record.textContent = `Recording: ${Math.round(100 * at)} %`;
+    }
+    recorder.stop();
+    await ended;
+    save(new Blob(parts, { type: "video/webm" }), `${title()}.webm`);
+    document.body.dataset.film = String(parts.reduce((sum, part) => sum + part.size, 0));
+  } finally {
+    Object.assign(record, { disabled: false, textContent: before });
+    record.focus();
+  }
+};
+button("film").hidden = !("MediaRecorder" in window) || !("captureStream" in HTMLCanvasElement.prototype);
+button("film").addEventListener("click", () => void attempt(film));
+
+button("link").addEventListener("click", () => void attempt(async () => {
+  await navigator.clipboard.writeText(location.href);
+  complain("The address of this object is copied. Whoever opens it needs the token of this server.");
+}));
+toolbar(box("film-tools"));
