@@ -3,8 +3,8 @@ import { attempt, box, button, call, get, input, make } from "./dom.js";
 import { app, viewed } from "./state.js";
 
 const CHANNELS = 14;
-/** Voxels along the longest side of the object, to see what hangs together. */
-const GRID = 48;
+/** Voxels along the longest side of the object, to see what hangs together: several Gaussians in each. */
+const GRID = 20;
 /** Parts with a smaller share of the Gaussians are floaters. */
 const SHARE = 0.02;
 
@@ -92,8 +92,13 @@ const save = async (kept, undoes = false) => {
  * Gaussians of parts that hang together with few others, or none, are left out.
  * @param {Edit} of
  */
-const tidy = ({ rows, kept, low, high }) => {
-  const step = Math.max(...high.map((v, axis) => v - low[axis])) / GRID || 1, side = GRID + 3;
+const tidy = ({ rows, kept, low }) => {
+  // What floats far away makes the object no larger.
+  const extent = [0, 1, 2].map((axis) => {
+    const sorted = Float32Array.from({ length: rows.length / CHANNELS }, (_, i) => rows[i * CHANNELS + axis]).sort();
+    return sorted[Math.floor(0.95 * sorted.length)] - sorted[Math.floor(0.05 * sorted.length)];
+  });
+  const step = Math.max(...extent) / GRID || 1, side = 100_000;
   /** @type {Map<number, number[]>} */
   const cells = new Map();
   kept.forEach((v, i) => {
