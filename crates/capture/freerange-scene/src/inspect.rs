@@ -258,7 +258,7 @@ pub fn sheet(loaded: &Loaded, inspection: &Inspection) -> Result<RgbaImage, Scen
     for (i, (view, report)) in loaded.views.iter().zip(&inspection.views).enumerate() {
         let place = i as u32 + 1;
         let (x, y) = (place % columns * TILE, head + place / columns * (TILE + 2 * LINE));
-        let picture = tile(view, &loaded.whole.get(i)?, report, center, radius);
+        let picture = tile(view, loaded.whole.get(i)?.as_ref(), report, center, radius);
         image::imageops::overlay(&mut sheet, &picture, i64::from(x), i64::from(y + LINE));
         let ink = if report.doubtful() || report.cut_off { RED } else { INK };
         let line = format!(
