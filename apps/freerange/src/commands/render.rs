@@ -30,7 +30,7 @@ pub struct Args {
     /// Also the depth of the surface: NAME_depth.npy, camera z in the file's units, float32; infinite where nothing is.
     #[arg(long)]
     depth: bool,
-    /// Also its normals: NAME_normals.png, as (n + 1) / 2 with x right, y up and z toward the camera; transparent where nothing is.
+    /// Also its normals, NAME_normals.png: (n + 1) / 2, x right, y up, z toward the camera. Transparent where nothing is.
     #[arg(long)]
     normals: bool,
     /// Output folder.

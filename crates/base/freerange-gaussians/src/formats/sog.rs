@@ -409,14 +409,20 @@ mod tests {
             state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
             (state >> 16) as u16
         };
-        let positions: Vec<[u16; 3]> = (0..5000).map(|_| [random(), random(), random()]).collect();
+        // A sheet, as surfaces are.
+        let positions: Vec<[u16; 3]> = (0..5000)
+            .map(|_| {
+                let (x, y) = (random(), random());
+                [x, y, x / 2 + y / 4]
+            })
+            .collect();
         let bytes = |order: &[usize]| {
             let high = |i: &usize| opaque(positions[*i].map(|v| (v >> 8) as u8));
             square(order.iter().flat_map(high).collect(), order.len()).len()
         };
         let mut order = along_curve(&positions);
         let (sorted, unsorted) = (bytes(&order), bytes(&(0..5000).collect::<Vec<_>>()));
-        assert!(5 * sorted < 4 * unsorted, "{sorted} of {unsorted} bytes");
+        assert!(3 * sorted < 2 * unsorted, "{sorted} of {unsorted} bytes");
         order.sort_unstable();
         assert!(order.into_iter().eq(0..5000), "each once");
     }

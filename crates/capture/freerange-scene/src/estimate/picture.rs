@@ -55,7 +55,7 @@ impl Picture {
     }
 
     /// What other pictures are compared with: without its own colors and edges.
-    pub fn to_compare(mut self) -> Self {
+    pub fn into_comparable(mut self) -> Self {
         (self.lab, self.alike) = (Vec::new(), Vec::new());
         self
     }

@@ -44,7 +44,7 @@ impl Stage {
     pub(super) fn sharpen(&self, views: &[View], small: &Masks) -> Result<Sharp, SceneError> {
         let many = views.len() > AT_ONCE;
         let large = |i: usize| Picture::of(&views[i], LARGE);
-        let seen = |i| if many { large(i).to_compare() } else { large(i) };
+        let seen = |i| if many { large(i).into_comparable() } else { large(i) };
         let pictures: Vec<Picture> = (0..views.len()).into_par_iter().map(seen).collect();
         let shares: Vec<Vec<f32>> = (0..views.len())
             .map(|i| {

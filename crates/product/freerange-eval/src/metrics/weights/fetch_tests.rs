@@ -14,8 +14,6 @@ use crate::metrics::weights::Weights;
 #[derive(Clone, Default)]
 struct Answer {
     body: Vec<u8>,
-    /// The `ETag`, as the hub sends it.
-    etag: String,
     /// Bytes after which the connection is closed.
     cut: Option<usize>,
 }
@@ -40,8 +38,7 @@ impl Server {
                 let mut stream = stream.unwrap();
                 let mut lines = BufReader::new(stream.try_clone().unwrap()).lines().map_while(Result::ok);
                 let Some(first) = lines.next() else { continue };
-                let range =
-                    lines.take_while(|l| !l.is_empty()).any(|l| l.to_lowercase().starts_with("range: bytes=0-0"));
+                lines.take_while(|l| !l.is_empty()).for_each(drop);
                 let path = first.split(' ').nth(1).unwrap_or("").to_owned();
                 let answer = shared.answers.lock().unwrap().get(&path).cloned();
                 shared.requests.lock().unwrap().push(path);
@@ -50,18 +47,10 @@ impl Server {
                         .write_all(b"HTTP/1.1 404 Not Found\r\nContent-Length: 4\r\nConnection: close\r\n\r\nnone");
                     continue;
                 };
-                let common = format!("ETag: \"{}\"\r\nX-Repo-Commit: {COMMIT}\r\nConnection: close\r\n", a.etag);
-                let total = a.body.len();
-                let (head, body) = match range {
-                    true => (
-                        format!("206 Partial Content\r\nContent-Range: bytes 0-0/{total}\r\nContent-Length: 1"),
-                        &a.body[..1],
-                    ),
-                    false => (format!("200 OK\r\nContent-Length: {total}"), &a.body[..a.cut.unwrap_or(total)]),
-                };
+                let head = format!("HTTP/1.1 200 OK\r\nContent-Length: {}\r\nConnection: close\r\n\r\n", a.body.len());
                 // The client may hang up early.
-                let _ = stream.write_all(format!("HTTP/1.1 {head}\r\n{common}\r\n").as_bytes());
-                let _ = stream.write_all(body);
+                let _ = stream.write_all(head.as_bytes());
+                let _ = stream.write_all(&a.body[..a.cut.unwrap_or(a.body.len())]);
             }
         });
         server
@@ -72,7 +61,21 @@ impl Server {
     }
 
     fn body(&self, path: &str, body: &[u8]) {
-        self.put(path, Answer { body: body.to_vec(), etag: sha(body), cut: None });
+        self.put(path, Answer { body: body.to_vec(), cut: None });
+    }
+
+    /// What the hub says of a repository: its commit, and its files. It keeps a SHA-256 of large ones only.
+    fn publish(&self, repository: &str, model: &[u8], config: &[u8]) {
+        let commit = format!("{{\"sha\":\"{COMMIT}\"}}");
+        self.body(&format!("/api/models/{repository}/revision/main"), commit.as_bytes());
+        let files = format!(
+            "[{{\"path\":\"config.json\",\"size\":{}}},\
+             {{\"path\":\"model.safetensors\",\"size\":{},\"lfs\":{{\"oid\":\"{}\"}}}}]",
+            config.len(),
+            model.len(),
+            sha(model)
+        );
+        self.body(&format!("/api/models/{repository}/tree/{COMMIT}"), files.as_bytes());
     }
 
     fn options(&self) -> FetchOptions {
@@ -116,12 +119,9 @@ fn files_in(folder: &Path) -> Vec<String> {
 fn hub_files_come_once_and_are_checked() {
     let server = Server::start();
     let (model, config) = (vec![7u8; 300_000], b"{}".to_vec());
-    server.body("/facebook/dinov2-small/resolve/main/model.safetensors", &model);
+    server.publish("facebook/dinov2-small", &model, &config);
     server.body(&format!("/facebook/dinov2-small/resolve/{COMMIT}/model.safetensors"), &model);
-    // Small files have a Git hash, which says nothing about SHA-256.
-    let small = Answer { body: config.clone(), etag: "9e26dfeeb6e641a33dae4961196235bdb965b21b".to_owned(), cut: None };
-    server.put("/facebook/dinov2-small/resolve/main/config.json", small.clone());
-    server.put(&format!("/facebook/dinov2-small/resolve/{COMMIT}/config.json"), small);
+    server.body(&format!("/facebook/dinov2-small/resolve/{COMMIT}/config.json"), &config);
     let folder = tempfile::tempdir().unwrap();
     let mut seen = Vec::new();
     let mut progress = |name: &str, done: u64, total: Option<u64>| seen.push((name.to_owned(), done, total));
@@ -144,10 +144,9 @@ fn hub_files_come_once_and_are_checked() {
     fetch("dinov2-small", folder.path(), &server.options(), &mut quiet).unwrap();
     assert_eq!(std::fs::read(&files[0]).unwrap(), model, "a damaged file is fetched anew");
 
-    // The hub's file is not what its ETag says.
+    // The hub's file is not the one that it lists.
     std::fs::remove_file(&files[0]).unwrap();
-    let wrong = Answer { body: model, etag: sha(b"something else"), cut: None };
-    server.put("/facebook/dinov2-small/resolve/main/model.safetensors", wrong);
+    server.publish("facebook/dinov2-small", &[8; 300_000], &config);
     let error = fetch("dinov2-small", folder.path(), &server.options(), &mut quiet).unwrap_err();
     assert!(matches!(error, MetricsError::Checksum { .. }), "{error}");
     assert!(!files[0].exists());
@@ -165,7 +164,7 @@ fn failed_downloads_leave_nothing() {
     let error = fetched(&target("/none.pth", "")).unwrap_err();
     assert!(matches!(&error, MetricsError::Download { reason, .. } if reason.contains("404")), "{error}");
     let body = vec![3u8; 100_000];
-    server.put("/cut.pth", Answer { body: body.clone(), cut: Some(40_000), ..Default::default() });
+    server.put("/cut.pth", Answer { body: body.clone(), cut: Some(40_000) });
     let error = fetched(&target("/cut.pth", "")).unwrap_err();
     assert!(matches!(&error, MetricsError::Download { url, .. } if url.ends_with("/cut.pth")), "{error}");
     server.body("/wrong.pth", &body);
