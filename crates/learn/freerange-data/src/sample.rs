@@ -127,7 +127,7 @@ pub(crate) fn view_entry(i: usize, format: ImageFormat) -> String {
 /// Name of the tensor of the Gaussians before the tree.
 const LEAVES: &str = "leaves";
 
-/// Names of the tensors of quick fit `i`: as it is, and target.
+/// Names of the tensors of initial fit `i` and of its target.
 fn fit_names(i: usize) -> [String; 2] {
     [format!("input_fit_{i:02}"), format!("input_fit_{i:02}_target")]
 }

@@ -1,4 +1,4 @@
-//! Masks refined with what the other views show: a quick fit of all the others says where the object is in a view, and in which color.
+//! Masks refined with what the other views show: an initial fit of all the others says where the object is in a view, and in which color.
 
 use super::mask::{enlarged, smooth};
 use super::odds::odds;

@@ -27,8 +27,6 @@ pub struct Client {
 /// A file of a repository.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Entry {
-    /// Path in the repository.
-    pub path: String,
     /// Size in bytes.
     pub size: u64,
     /// SHA-256 in hexadecimal. The hub keeps it for large files only.
@@ -88,7 +86,7 @@ impl Client {
             return Err(failed(&list, format!("expected the file {path}, found none of this name")));
         };
         let url = format!("{}/{repository}/resolve/{commit}/{path}", self.address);
-        Ok((Entry { path: found.path, size: found.size, sha256: found.lfs.map(|l| l.oid) }, url))
+        Ok((Entry { size: found.size, sha256: found.lfs.map(|l| l.oid) }, url))
     }
 
     /// Downloads a file beside `target`, whose folder is made, and returns it with its SHA-256.

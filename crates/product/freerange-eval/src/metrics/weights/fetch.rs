@@ -107,7 +107,8 @@ impl From<HubError> for MetricsError {
         match e {
             HubError::Download { url, reason } => Self::Download { url, reason },
             HubError::Io(e) => Self::io(&e.path, e.source),
-            e => Self::Download { url: String::new(), reason: e.to_string() },
+            // Names, caches and hashes of models: not asked for here.
+            e => Self::Download { url: "the hub".into(), reason: e.to_string() },
         }
     }
 }
