@@ -18,7 +18,7 @@ mod _core {
     use super::{
         model::{Model, load},
         raster::{Rendered, rasterize, reference},
-        scene::{Scene, read_gaussians, read_scene, write_gaussians},
+        scene::{Scene, read_gaussians, read_scene, scene_of_views, seen_from, transform, write_gaussians},
     };
 
     #[pymodule_init]

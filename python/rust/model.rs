@@ -19,7 +19,7 @@ use crate::{
     arguments::{RawOptions, RawUp, RawView, refuse, told, views},
     error::{of_hub, of_model},
     raster::bytes,
-    scene::Scene,
+    scene::{Scene, told_notes},
 };
 
 /// How often Ctrl-C is looked for, at least; asking at every step of a fit would take the interpreter from other threads.
@@ -62,7 +62,7 @@ fn local(path: &Path) -> PyResult<Cow<'_, Path>> {
 }
 
 /// Samples as rows of `float32`, the direction of up, notes, and seconds per stage.
-type Made = (Vec<Py<PyByteArray>>, [f64; 3], Vec<String>, Vec<(&'static str, f64)>);
+type Made = (Vec<Py<PyByteArray>>, [f64; 3], Vec<(bool, String)>, Vec<(&'static str, f64)>);
 
 #[pymethods]
 impl Model {
@@ -108,9 +108,7 @@ impl Model {
         options.frame = FrameConfig { up, center, radius, ..FrameConfig::default() };
         let notes = py.detach(|| {
             self.model.check(&options).map_err(of_model)?;
-            cut_out(&mut views, &Hints { center, radius, ..Hints::default() })
-                .map(|notes| notes.into_iter().map(|note| note.text).collect())
-                .map_err(of_model)
+            cut_out(&mut views, &Hints { center, radius, ..Hints::default() }).map(told_notes).map_err(of_model)
         })?;
         self.run(py, &views, &options, notes, on_step)
     }
@@ -124,8 +122,8 @@ impl Model {
         on_step: Option<Py<PyAny>>,
     ) -> PyResult<Made> {
         let mut options = chosen.options(&self.model)?;
-        options.frame = scene.inner.frame;
-        self.run(py, scene.inner.views(), &options, scene.notes(), on_step)
+        options.frame = scene.frame;
+        self.run(py, &scene.views, &options, scene.notes(), on_step)
     }
 }
 
@@ -135,7 +133,7 @@ impl Model {
         py: Python<'_>,
         views: &[View],
         options: &Options,
-        mut notes: Vec<String>,
+        mut notes: Vec<(bool, String)>,
         on_step: Option<Py<PyAny>>,
     ) -> PyResult<Made> {
         let mut stopped: PyResult<()> = Ok(());
@@ -169,7 +167,7 @@ impl Model {
         let result = result.map_err(of_model)?;
         let samples = result.samples.iter().map(|s| bytes(py, s.gaussians.rows())).collect();
         let up = result.up().to_array();
-        notes.extend(result.notes.into_iter().map(|note| note.text));
+        notes.extend(told_notes(result.notes.clone()));
         Ok((samples, up, notes, result.seconds.iter().map(|(stage, s)| (stage.name(), *s)).collect()))
     }
 }

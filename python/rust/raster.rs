@@ -35,10 +35,12 @@ pub fn rasterize(
     rows: PyBackedBytes,
     raw: Vec<RawCamera>,
     backgrounds: Vec<[f32; 3]>,
+    depth: bool,
 ) -> PyResult<Rendered> {
     let rows = floats("gaussians", &rows)?;
     let cameras: Vec<Camera> = cameras(raw)?;
-    let output = py.detach(|| render(&rows, &cameras, &backgrounds, &RasterConfig::default())).map_err(of_raster)?;
+    let config = RasterConfig { depth, ..RasterConfig::default() };
+    let output = py.detach(|| render(&rows, &cameras, &backgrounds, &config)).map_err(of_raster)?;
     Ok(Rendered { rows, output })
 }
 
@@ -54,15 +56,22 @@ impl Rendered {
         bytes(py, &self.output.alpha)
     }
 
-    /// d loss / d rgb and d loss / d alpha to d loss / d rows and d loss / d backgrounds.
+    /// Sum of blending weight times camera z, `[views, h, w]`; empty where no depth was asked for.
+    fn depth(&self, py: Python<'_>) -> Py<PyByteArray> {
+        bytes(py, &self.output.depth)
+    }
+
+    /// d loss / d (rgb, alpha, depth) to d loss / d rows and d loss / d backgrounds; that of depth may be empty.
     fn backward(
         &self,
         py: Python<'_>,
         d_rgb: PyBackedBytes,
         d_alpha: PyBackedBytes,
+        d_depth: PyBackedBytes,
     ) -> PyResult<(Py<PyByteArray>, Py<PyByteArray>)> {
         let (d_rgb, d_alpha) = (floats("d_rgb", &d_rgb)?, floats("d_alpha", &d_alpha)?);
-        let gradients = py.detach(|| render_backward(&self.rows, &self.output, &d_rgb, &d_alpha, &[]));
+        let d_depth = floats("d_depth", &d_depth)?;
+        let gradients = py.detach(|| render_backward(&self.rows, &self.output, &d_rgb, &d_alpha, &d_depth));
         let gradients = gradients.map_err(of_raster)?;
         Ok((bytes(py, &gradients.gaussians), bytes(py, gradients.backgrounds.as_flattened())))
     }

@@ -3,13 +3,14 @@
 use std::path::PathBuf;
 
 use freerange::{
-    CameraFormat, Gaussians, Hints, LoadConfig, MaskSource, Note, ReadConfig, SceneConfig, Turntable, View,
+    CameraFormat, FrameConfig, Gaussians, Harmonics, Hints, LoadConfig, MaskSource, Note, NoteKind, ReadConfig,
+    SceneConfig, Splats, Turntable, View, cut_out,
 };
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 use pyo3::{prelude::*, pybacked::PyBackedBytes, types::PyByteArray};
 
 use crate::{
-    arguments::{RawCamera, RawUp, floats, raw_camera, refuse, told},
+    arguments::{RawCamera, RawUp, RawView, floats, raw_camera, refuse, told, views},
     error::of_model,
     raster::bytes,
 };
@@ -17,7 +18,10 @@ use crate::{
 /// Photos with cameras, cut out.
 #[pyclass(frozen)]
 pub struct Scene {
-    pub inner: freerange::Scene,
+    pub views: Vec<View>,
+    further: Vec<View>,
+    pub frame: FrameConfig,
+    notes: Vec<Note>,
 }
 
 /// How photos are read; as on the command line.
@@ -64,8 +68,27 @@ pub fn read_scene(py: Python<'_>, path: PathBuf, photos: Photos, up: RawUp) -> P
     let up = up.read(true)?;
     py.detach(|| {
         let config = SceneConfig { cameras: read, photos: config, up };
-        Ok(Scene { inner: freerange::Scene::open_with(&path, &config).map_err(of_model)? })
+        let read = freerange::Scene::open_with(&path, &config).map_err(of_model)?;
+        let (frame, notes) = (read.frame, read.notes);
+        Ok(Scene { views: read.loaded.views, further: read.loaded.further, frame, notes })
     })
+}
+
+/// Makes a scene of views in memory; those without a mask get one.
+#[pyfunction]
+pub fn scene_of_views(
+    py: Python<'_>,
+    raw: Vec<RawView>,
+    up: RawUp,
+    center: Option<[f64; 3]>,
+    radius: Option<f64>,
+) -> PyResult<Scene> {
+    let (mut views, up) = (views(raw)?, up.read(false)?.unwrap_or_default());
+    let center = center.map(DVec3::from);
+    let frame = FrameConfig { up, center, radius, ..FrameConfig::default() };
+    let hints = Hints { center, radius, ..Hints::default() };
+    let notes = py.detach(|| cut_out(&mut views, &hints)).map_err(of_model)?;
+    Ok(Scene { views, further: Vec::new(), frame, notes })
 }
 
 /// A view: its name, its camera, RGBA of 8 bits.
@@ -80,49 +103,102 @@ fn all(py: Python<'_>, views: &[View]) -> Vec<Whole> {
 impl Scene {
     /// What it is reconstructed from.
     fn views(&self, py: Python<'_>) -> Vec<Whole> {
-        all(py, self.inner.views())
+        all(py, &self.views)
     }
 
     /// What it is only compared with.
     fn further(&self, py: Python<'_>) -> Vec<Whole> {
-        all(py, self.inner.further())
+        all(py, &self.further)
     }
 
     /// What was understood, for the user to read.
     #[pyo3(name = "notes")]
-    fn notes_in_python(&self) -> Vec<String> {
+    fn notes_in_python(&self) -> Vec<(bool, String)> {
         self.notes()
     }
 }
 
 impl Scene {
-    pub fn notes(&self) -> Vec<String> {
-        self.inner.notes.iter().map(|note| note.text.clone()).collect()
+    pub fn notes(&self) -> Vec<(bool, String)> {
+        told_notes(self.notes.clone())
     }
 }
 
-fn texts(notes: Vec<Note>) -> Vec<String> {
-    notes.into_iter().map(|note| note.text).collect()
+/// Sentences for the user, and whether each tells of something that is left out or may be wrong.
+pub fn told_notes(notes: Vec<Note>) -> Vec<(bool, String)> {
+    let grave = |kind| matches!(kind, NoteKind::Dropped | NoteKind::Warning);
+    notes.into_iter().map(|note| (grave(note.kind), note.text)).collect()
+}
+
+/// Rows of 14 channels, and harmonics `[n, k, 3]` of a degree: what Python has of Gaussians.
+type RawSplats = (Py<PyByteArray>, usize, Py<PyByteArray>);
+
+fn raw(py: Python<'_>, splats: Splats) -> RawSplats {
+    let harmonics = bytes(py, splats.harmonics.rows());
+    let degree = splats.harmonics.degree();
+    (bytes(py, splats.into_cloud().rows()), degree, harmonics)
 }
 
 /// Writes Gaussians in the format of the file's extension; what the format could not hold.
 #[pyfunction]
-pub fn write_gaussians(py: Python<'_>, rows: PyBackedBytes, path: PathBuf, up: [f64; 3]) -> PyResult<Vec<String>> {
-    let cloud = cloud(&rows)?;
-    py.detach(|| freerange::write_gaussians(&cloud, &path, up.into())).map(texts).map_err(of_model)
+pub fn write_gaussians(
+    py: Python<'_>,
+    rows: PyBackedBytes,
+    degree: usize,
+    harmonics: PyBackedBytes,
+    path: PathBuf,
+    up: [f64; 3],
+) -> PyResult<Vec<(bool, String)>> {
+    let splats = splats(&rows, degree, &harmonics)?;
+    py.detach(|| freerange::write_splats(&splats, &path, up.into())).map(told_notes).map_err(of_model)
 }
 
 /// Reads Gaussians from a file; those that fix their frame are turned into the one in which `up` is up.
 #[pyfunction]
-pub fn read_gaussians(py: Python<'_>, path: PathBuf, up: [f64; 3]) -> PyResult<(Py<PyByteArray>, Vec<String>)> {
-    let (cloud, notes) = py.detach(|| freerange::read_gaussians(&path, up.into())).map_err(of_model)?;
-    Ok((bytes(py, cloud.rows()), texts(notes)))
+pub fn read_gaussians(py: Python<'_>, path: PathBuf, up: [f64; 3]) -> PyResult<(RawSplats, Vec<(bool, String)>)> {
+    let (splats, notes) = py.detach(|| freerange::read_splats(&path, up.into())).map_err(of_model)?;
+    Ok((raw(py, splats), told_notes(notes)))
 }
 
-fn cloud(rows: &[u8]) -> PyResult<Gaussians> {
-    let rows = floats("gaussians", rows)?;
-    match rows.len() % freerange_raster::CHANNELS {
-        0 => Ok(Gaussians::from_rows(rows)),
-        _ => Err(refuse("gaussians", "rows of 14 numbers", format!("{} numbers", rows.len()))),
+/// Gaussians moved by `x -> scale * rotation * x + translation`; `rotation` is w x y z.
+#[pyfunction]
+pub fn transform(
+    py: Python<'_>,
+    rows: PyBackedBytes,
+    degree: usize,
+    harmonics: PyBackedBytes,
+    scale: f64,
+    rotation: [f64; 4],
+    translation: [f64; 3],
+) -> PyResult<RawSplats> {
+    let mut splats = splats(&rows, degree, &harmonics)?;
+    let [w, x, y, z] = rotation;
+    splats.transform(scale, DQuat::from_xyzw(x, y, z, w), translation.into());
+    Ok(raw(py, splats))
+}
+
+/// The rows with the colors that are seen from `eye`.
+#[pyfunction]
+pub fn seen_from(
+    py: Python<'_>,
+    rows: PyBackedBytes,
+    degree: usize,
+    harmonics: PyBackedBytes,
+    eye: [f64; 3],
+) -> PyResult<Py<PyByteArray>> {
+    Ok(bytes(py, splats(&rows, degree, &harmonics)?.seen_from(eye.into()).rows()))
+}
+
+fn splats(rows: &[u8], degree: usize, harmonics: &[u8]) -> PyResult<Splats> {
+    let (rows, harmonics) = (floats("gaussians", rows)?, floats("sh", harmonics)?);
+    if rows.len() % freerange_raster::CHANNELS != 0 {
+        return Err(refuse("gaussians", "rows of 14 numbers", format!("{} numbers", rows.len())));
     }
+    let cloud = Gaussians::from_rows(rows);
+    let each = 3 * ((degree + 1) * (degree + 1) - 1);
+    if degree > 3 || harmonics.len() != each * cloud.len() {
+        let expected = format!("{each} numbers for each of {} Gaussians, degree 3 at most", cloud.len());
+        return Err(refuse("sh", &expected, format!("{} numbers of degree {degree}", harmonics.len())));
+    }
+    Ok(Splats { harmonics: Harmonics::from_rows(degree, harmonics), ..Splats::from(cloud) })
 }

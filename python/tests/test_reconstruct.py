@@ -31,7 +31,7 @@ def test_the_readmes_five_lines(tmp_path, monkeypatch):
     told = {}
     exec(code, told)
     assert (tmp_path / "bowl.glb").stat().st_size > 100_000
-    assert told["picture"].shape == (512, 512, 3)
+    assert told["image"].shape == (512, 512, 3)
 
 
 STAGES = ["canonicalize", "symmetry", "propose", "refine", "optimize"]
@@ -65,7 +65,7 @@ def test_the_result_looks_like_the_images(model, bowl):
     h, w = images.shape[1:3]
     steps = []
     gaussians = model.reconstruct(images, intrinsics, c2w, iterations=100, set={"propose.count": 1}, on_step=steps.append)
-    pictures = gaussians.render(c2w, intrinsics, w, h)
+    pictures = gaussians.render(c2w, intrinsics, w, h).rgb
     assert pictures.shape == (4, h, w, 3) and pictures.dtype == np.float32
     assert min(psnr(p, over_white(i)) for p, i in zip(pictures, images)) > 30.0
     stages = [step.stage for step in steps]
@@ -114,6 +114,72 @@ def test_scenes_are_read(bowl):
     assert np.array_equal(np.stack(scene.images), images)
     assert np.allclose(scene.intrinsics, intrinsics)
     assert np.allclose(scene.c2w, c2w @ np.diag([1.0, -1.0, -1.0, 1.0]), atol=1e-6)
+
+
+def test_scenes_of_arrays_and_names_of_gsplat(model, bowl):
+    """Arrays in, under either names, give what the folder gives."""
+    images, intrinsics, c2w = bowl
+    opencv = c2w @ np.diag([1.0, -1.0, -1.0, 1.0])
+    quick = dict(iterations=0, symmetry="off", set={"refine.passes": 1})
+    expected = model.reconstruct_scene(BOWL, **quick)
+    scene = freerange.Scene.from_arrays(images, viewmats=np.linalg.inv(opencv), Ks=intrinsics, names=list("abcd"))
+    assert scene.names == list("abcd") and len(scene.further[0]) == 0
+    assert np.allclose(scene.viewmats, np.linalg.inv(opencv)) and np.array_equal(scene.Ks, intrinsics)
+    for found in (
+        model.reconstruct_scene(scene, **quick),
+        model.reconstruct(images, viewmats=np.linalg.inv(opencv), Ks=intrinsics, **quick),
+    ):
+        assert np.allclose(found.means, expected.means, atol=1e-4) and len(found) == len(expected)
+    with pytest.raises(ValueError, match="names"):
+        freerange.Scene.from_arrays(images, intrinsics, opencv, names=["a"])
+    with pytest.raises(TypeError, match="reconstruction"):
+        freerange.Scene.from_pycolmap({}, BOWL)
+
+
+def test_a_reconstruction_of_pycolmap(bowl, tmp_path):
+    """Cameras with distortion, in memory: as our reader takes them from disk. In a process of its own, since both bring libraries of
+    images."""
+    pytest.importorskip("pycolmap")
+    code = """
+import sys, numpy as np, pycolmap, freerange
+folder, images = sys.argv[1:]
+poses = np.load(folder + "/c2w.npy")
+model = pycolmap.Reconstruction()
+camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=512, height=512, params=[560.0, 256.0, 256.0, 0.02], camera_id=1)
+model.add_camera_with_trivial_rig(camera)
+for i, c2w in enumerate(poses):
+    pose = np.linalg.inv(c2w)[:3]
+    image = pycolmap.Image(name=f"r_{i}.png", camera_id=1, image_id=i + 1)
+    model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
+scene = freerange.Scene.from_pycolmap(model, images)
+assert len(scene) == len(poses), scene
+assert np.allclose(scene.c2w[:, :3, 3], poses[:, :3, 3], atol=1e-5), scene.c2w
+assert any("SIMPLE_RADIAL" in note or "distort" in note for note in scene.notes), scene.notes
+"""
+    import shutil
+    import sys
+
+    np.save(tmp_path / "c2w.npy", bowl[2] @ np.diag([1.0, -1.0, -1.0, 1.0]))
+    for i in range(4):
+        told = json.loads((BOWL / "transforms_train.json").read_text())["frames"][i]["file_path"]
+        shutil.copy((BOWL / told).with_suffix(".png"), tmp_path / f"r_{i}.png")
+    run = subprocess.run([sys.executable, "-c", code, tmp_path, tmp_path], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+
+
+def test_help_is_readable(model):
+    """Every public function has its arguments in its signature and in its text."""
+    import inspect
+
+    for function in (
+        freerange.load, freerange.render, freerange.Scene.read, freerange.Scene.from_arrays, freerange.Scene.from_pycolmap,
+        freerange.Model.reconstruct, freerange.Model.reconstruct_scene, freerange.Gaussians.__init__, freerange.Gaussians.read,
+    ):
+        text = inspect.getdoc(function)
+        for name, parameter in inspect.signature(function).parameters.items():
+            assert parameter.kind is not parameter.VAR_KEYWORD or name == "options", function
+            if name not in ("self", "cls"):
+                assert name in text, f"{function.__qualname__}: {name}"
 
 
 def test_an_exception_in_on_step_ends_the_work(model):
@@ -217,7 +283,10 @@ def spoiled(array, at):
         (dict(init="zero"), ValueError, ["init", "'fit' or 'flow'", "'zero'"]),
         (dict(precision="f8"), ValueError, ["precision", "'bf16'", "'f8'"]),
         (dict(quality="best"), ValueError, ["quality", "'high'", "'best'"]),
-        (dict(refinement=3), TypeError, ["refinement", "iterations", "another name"]),
+        (dict(refinement=3), TypeError, ["refinement", "unexpected keyword"]),
+        (dict(quality=3), TypeError, ["quality", "a name", "3"]),
+        (dict(viewmats=lambda i, k, c: c), TypeError, ["c2w", "viewmats", "both"]),
+        (dict(Ks=lambda i, k, c: k), TypeError, ["intrinsics", "Ks", "both"]),
         (dict(convention="blender"), ValueError, ["convention", "'opengl'", "'blender'"]),
         (dict(up="north"), ValueError, ["up", "'cameras'", "'north'"]),
         (dict(up=(0, 0, 0)), ValueError, ["up", "not all zero"]),
@@ -229,7 +298,7 @@ def spoiled(array, at):
 def test_bad_input_is_named(model, bowl, change, error, words):
     arguments = dict(zip(("images", "intrinsics", "c2w"), bowl), convention="opengl")
     for field, value in change.items():
-        arguments[field] = value(*bowl) if field in ("images", "intrinsics", "c2w", "masks") else value
+        arguments[field] = value(*bowl) if callable(value) else value
     with pytest.raises(error) as caught:
         model.reconstruct(**arguments)
     assert all(word in str(caught.value) for word in words), str(caught.value)

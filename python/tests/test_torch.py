@@ -25,7 +25,7 @@ def tensors(scattered, dtype=torch.float64):
 
 
 def test_gradients_are_those_of_differences(scattered):
-    """`gradcheck`, in all five arrays and the background, of colour and alpha.
+    """`gradcheck`, in all five arrays and the background, of color, alpha and depth.
 
     The rasteriser computes in float32: pictures are rounded to 6e-8, and a difference over twice 5e-3 to 1e-5; its own error is of the
     order of 5e-3 squared. Hence steps and tolerances that are larger than those for doubles. The scene is one in which every
@@ -36,7 +36,7 @@ def test_gradients_are_those_of_differences(scattered):
 
     def pictures(*arrays):
         *arrays, background = arrays
-        return freerange.render(*arrays, c2w, k, width, height, background)
+        return tuple(freerange.render(*arrays, c2w, k, width, height, background, depth=True))
 
     arrays = (*gaussians.values(), background)
     assert torch.autograd.gradcheck(pictures, arrays, eps=5e-3, atol=2e-3, rtol=1e-2, nondet_tol=0.0)
@@ -49,7 +49,7 @@ def test_gradients_are_those_of_the_reference(scattered):
     weights = torch.tensor(np.random.default_rng(3).normal(size=(height, width, 3)), dtype=torch.float32)
     from freerange.torch import rasterize
 
-    rgb, alpha = rasterize(rows, c2w, k, width, height, 0.25)
+    rgb, alpha, _ = rasterize(rows, c2w, k, width, height, 0.25)
     ((rgb * weights).sum() + alpha.sum()).backward()
     camera = (width, height, (k[0, 0], k[1, 1], k[0, 2], k[1, 2]), c2w.tolist())
 
@@ -61,7 +61,7 @@ def test_gradients_are_those_of_the_reference(scattered):
     start = np.round(rows.detach().numpy().astype(np.float64) / step) * step
     # At numbers that are multiples of the step.
     again = torch.tensor(start, dtype=torch.float32, requires_grad=True)
-    rgb, alpha = rasterize(again, c2w, k, width, height, 0.25)
+    rgb, alpha, _ = rasterize(again, c2w, k, width, height, 0.25)
     ((rgb * weights).sum() + alpha.sum()).backward()
     expected = np.zeros_like(start)
     for i in np.ndindex(start.shape):
@@ -76,11 +76,15 @@ def test_gradients_are_those_of_the_reference(scattered):
 
 def test_tensors_and_arrays_give_the_same(scattered):
     gaussians, (c2w, k, width, height) = tensors(scattered, torch.float32)
-    rgb, alpha = freerange.render(*gaussians.values(), torch.tensor(c2w), torch.tensor(k), width, height, 0.5)
-    plain = freerange.render(**scattered[0], c2w=c2w, K=k, width=width, height=height, background=0.5)
+    rgb, alpha, z = freerange.render(*gaussians.values(), torch.tensor(c2w), torch.tensor(k), width, height, 0.5, depth=True)
+    plain = freerange.render(**scattered[0], c2w=c2w, K=k, width=width, height=height, background=0.5, depth=True)
+    assert np.allclose(z.detach(), plain.depth, atol=1e-5)
+    names = ("means", "quats", "scales", "opacities", "colors")
+    other = freerange.render(*(gaussians[f] for f in names), viewmats=np.linalg.inv(c2w), Ks=k, width=width, height=height, background=0.5)
+    assert torch.allclose(other.rgb, rgb, atol=1e-6)
     assert rgb.dtype == torch.float32 and rgb.shape == (height, width, 3) and alpha.shape == (height, width)
     assert np.allclose(rgb.detach(), plain[0], atol=1e-5) and np.allclose(alpha.detach(), plain[1], atol=1e-5)
-    several, _ = freerange.render(*gaussians.values(), np.stack([c2w] * 3), k, width, height, torch.eye(3))
+    several, *_ = freerange.render(*gaussians.values(), np.stack([c2w] * 3), k, width, height, torch.eye(3))
     assert several.shape == (3, height, width, 3)
 
 
@@ -89,16 +93,29 @@ def test_memory_is_shared(scattered):
     assert torch.from_dlpack(means).data_ptr() == means.ctypes.data
 
 
+def test_tensors_as_gsplat_takes_them(scattered):
+    given = scattered[0]
+    made = freerange.Gaussians(**given, up=(0, 0, 1)).to_torch()
+    assert set(made) == {"means", "quats", "scales", "opacities", "colors"}
+    assert made["means"].shape == (5, 3) and made["opacities"].shape == (5,) and made["colors"].dtype == torch.float32
+    sh = np.zeros((5, 3, 3), dtype=np.float32)
+    sh[:, 1] = 0.25
+    colors = freerange.Gaussians(**given, sh=sh).to_torch()["colors"]
+    assert colors.shape == (5, 4, 3)
+    assert np.allclose(0.5 + 0.28209479177387814 * colors[:, 0].numpy(), given["colors"], atol=1e-6)
+    assert np.array_equal(colors[:, 1:].numpy(), sh)
+
+
 def test_it_can_be_optimised(scattered):
     """Colours that are wrong become right again."""
     gaussians, (c2w, k, width, height) = tensors(scattered, torch.float32)
     with torch.no_grad():
-        target, _ = freerange.render(*gaussians.values(), c2w, k, width, height)
+        target, *_ = freerange.render(*gaussians.values(), c2w, k, width, height)
     colors = torch.full((5, 3), 0.5, requires_grad=True)
     optimiser = torch.optim.Adam([colors], lr=0.05)
     losses = []
     for _ in range(200):
-        rgb, _ = freerange.render(*(gaussians | {"colors": colors}).values(), c2w, k, width, height)
+        rgb, *_ = freerange.render(*(gaussians | {"colors": colors}).values(), c2w, k, width, height)
         loss = ((rgb - target) ** 2).mean()
         optimiser.zero_grad()
         loss.backward()
@@ -112,7 +129,7 @@ def test_what_has_no_gradient_is_refused(scattered):
     pose = torch.tensor(c2w, requires_grad=True)
     with pytest.raises(ValueError, match="c2w: .*no gradient"):
         freerange.render(*gaussians.values(), pose, k, width, height)
-    rgb, _ = freerange.render(*gaussians.values(), c2w, k, width, height)
+    rgb, *_ = freerange.render(*gaussians.values(), c2w, k, width, height)
     (first,) = torch.autograd.grad((rgb**2).sum(), gaussians["means"], create_graph=True)
     with pytest.raises(RuntimeError, match="once_differentiable|twice"):
         first.sum().backward()

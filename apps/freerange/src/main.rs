@@ -21,8 +21,8 @@ use signals::Signals;
 
 /// Posed photos in, 3D Gaussians out.
 ///
-/// Reconstructs one object from as few as four photos with cameras. A network refines initial fits, then an optimization on
-/// the photos follows. Exit codes: 0 done, 1 failed, 2 bad input.
+/// Reconstructs one object from two or more photos with cameras; four is the measured case. A network refines initial fits,
+/// then an optimization on the photos follows. Exit codes: 0 done, 1 failed, 2 bad input.
 #[derive(Parser)]
 #[command(name = "freerange", version, max_term_width = 100)]
 struct Cli {
@@ -47,7 +47,7 @@ enum Command {
     /// object. Run the same command again to continue a stopped run. If an object fails, the others go on and the exit
     /// code is 1.
     Eval(Box<commands::eval::Args>),
-    /// List and download the published weights of metrics.
+    /// List and download the published weights of metrics. Needs a build with `--features networks`.
     #[command(subcommand)]
     Weights(commands::weights::Command),
     Train(commands::train::Args),

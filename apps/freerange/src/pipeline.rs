@@ -80,7 +80,7 @@ pub struct PipelineArgs {
 pub enum QualityName {
     /// One proposal, no symmetry, 150 steps at 256 pixels.
     Draft,
-    /// The setting of all reported results.
+    /// The setting of the main results.
     Default,
     /// Twice the optimization steps.
     High,

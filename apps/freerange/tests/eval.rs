@@ -556,7 +556,7 @@ fn weights_are_listed_or_the_build_that_can_is_named() {
     }
 }
 
-/// The real scanned objects: the same white figure as published in docs/results.md.
+/// The 21 test objects: the same white figure as published in docs/results.md.
 #[test]
 #[ignore = "needs FREERANGE_SHARED"]
 fn scanned_objects_have_the_figures_of_the_results() {

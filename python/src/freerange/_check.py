@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Union
+from typing import Any, Literal, Union
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +13,7 @@ Floats = npt.NDArray[np.float32]
 RawCamera = tuple[int, int, tuple[float, ...], list[list[float]]]
 Up = Union[str, tuple[float, float, float]]
 
+Convention = Literal["opencv", "opengl"]
 CONVENTIONS = ("opencv", "opengl")
 # OpenGL's cameras have y up and z backward.
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -79,12 +80,111 @@ def up(value: Any) -> Up:
 
 
 def color(field: str, value: Any, views: int) -> list[tuple[float, float, float]]:
-    """One colour for all views, or one for each."""
+    """One color for all views, or one for each."""
     found = array(field, value)
     if found.shape not in ((), (3,), (views, 3)):
         raise refuse(field, f"a number, the shape [3] or [{views}, 3]", list(found.shape))
     finite(field, found)
     return [tuple(row) for row in np.broadcast_to(found, (views, 3)).astype(np.float64).tolist()]
+
+
+def gaussians(
+    means: Any, scales: Any, quats: Any, opacities: Any, colors: Any
+) -> tuple[Array, Array, Array, Array, Array]:
+    """The five arrays; scales and quaternions in either order, which their shapes tell."""
+    if np.shape(scales)[-1:] == (4,) and np.shape(quats)[-1:] == (3,):
+        scales, quats = quats, scales
+    means = shaped("means", means, (None, 3), "[n, 3]")
+    n = len(means)
+    return (
+        means,
+        shaped("scales", scales, (n, 3), f"[{n}, 3]"),
+        shaped("quats", quats, (n, 4), f"[{n}, 4]"),
+        shaped("opacities", opacities, (n,), f"[{n}]"),
+        shaped("colors", colors, (n, 3), f"[{n}, 3]"),
+    )
+
+
+def harmonics(value: Any, n: int) -> Floats | None:
+    """Spherical harmonics without the constant, of `n` Gaussians."""
+    if value is None:
+        return None
+    found = array("sh", value)
+    if found.ndim != 3 or found.shape[0] != n or found.shape[1] not in (0, 3, 8, 15) or found.shape[2] != 3:
+        raise refuse("sh", f"the shape [{n}, k, 3] with k of 0, 3, 8 or 15", list(found.shape))
+    finite("sh", found)
+    return np.array(found, dtype=np.float32)
+
+
+def indices(value: Any, n: int) -> Array:
+    """Numbers of some of `n` things, or a mask of them."""
+    found = np.asarray(value)
+    if found.dtype.kind == "b":
+        if found.shape != (n,):
+            raise refuse("index", f"a mask of the shape [{n}]", list(found.shape))
+        return found
+    if found.size == 0:
+        return np.zeros(0, dtype=np.int64)
+    if found.dtype.kind not in "iu" or found.ndim != 1:
+        raise wrong_type("index", "a number, a slice, numbers or a mask", f"{type(value).__name__} of {found.dtype}")
+    if found.min() < -n or found.max() >= n:
+        raise IndexError(f"Gaussians {found.min()} to {found.max()} of {n}")
+    return found
+
+
+def similarity(
+    field: str, value: Any
+) -> tuple[float, Array, tuple[float, float, float, float], tuple[float, float, float]]:
+    """Scale, rotation (as a matrix, and as w x y z) and translation of a similarity."""
+    m = array(field, value).astype(np.float64)
+    if m.shape not in ((4, 4), (3, 4)):
+        raise refuse(field, "the shape [4, 4] or [3, 4]", list(m.shape))
+    finite(field, m)
+    if m.shape == (4, 4) and np.abs(m[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
+        raise refuse(field, "a last row of [0, 0, 0, 1]", m[3].tolist())
+    cube = float(np.linalg.det(m[:3, :3]))
+    scale = float(np.cbrt(cube))
+    if not scale > 0.0:
+        raise refuse(field, "a rotation times a scale above 0, no mirror", f"a determinant of {cube:g}")
+    r = m[:3, :3] / scale
+    off = float(np.abs(r @ r.T - np.eye(3)).max())
+    if off > 1e-4:
+        raise refuse(field, "a rotation times a scale", f"axes that are off by {off:.2g}")
+    # The eigenvector of the largest eigenvalue (Bar-Itzhack 2000): no case is special.
+    k = np.array(
+        [
+            [r[0, 0] - r[1, 1] - r[2, 2], 0.0, 0.0, 0.0],
+            [r[1, 0] + r[0, 1], r[1, 1] - r[0, 0] - r[2, 2], 0.0, 0.0],
+            [r[2, 0] + r[0, 2], r[2, 1] + r[1, 2], r[2, 2] - r[0, 0] - r[1, 1], 0.0],
+            [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], r[0, 0] + r[1, 1] + r[2, 2]],
+        ]
+    )
+    x, y, z, w = np.linalg.eigh(k)[1][:, -1].tolist()
+    tx, ty, tz = m[:3, 3].tolist()
+    return scale, r, (w, x, y, z), (tx, ty, tz)
+
+
+def cameras_given(c2w: Any, viewmats: Any, K: Any, Ks: Any, k_name: str) -> tuple[Any, Any]:
+    """Camera to world and intrinsics, each under one of its two names."""
+    if (K is None) == (Ks is None):
+        raise wrong_type(k_name, f"either {k_name} or Ks", "none" if K is None else "both")
+    if (c2w is None) == (viewmats is None):
+        raise wrong_type("c2w", "either c2w or viewmats", "none" if c2w is None else "both")
+    return (c2w if viewmats is None else inverted("viewmats", viewmats)), (Ks if K is None else K)
+
+
+def inverted(field: str, value: Any) -> Array:
+    """Camera to world of rigid world to camera, `[..., 4, 4]` or `[..., 3, 4]`."""
+    m = array(field, value).astype(np.float64)
+    if m.ndim not in (2, 3) or m.shape[-2:] not in ((4, 4), (3, 4)):
+        raise refuse(field, "the shape [v, 4, 4] or [v, 3, 4]", list(m.shape))
+    finite(field, m)
+    r, t = m[..., :3, :3], m[..., :3, 3:]
+    off = float(np.abs(r @ np.swapaxes(r, -1, -2) - np.eye(3)).max()) if m.size else 0.0
+    if off > 1e-3:
+        raise refuse(field, "rotations and translations", f"axes that are off by {off:.2g}")
+    back = np.swapaxes(r, -1, -2)
+    return np.concatenate([back, -back @ t], axis=-1)
 
 
 def cameras(
@@ -145,13 +245,13 @@ def images(value: Any, masks: Any) -> list[npt.NDArray[np.uint8]]:
     listed = _listed("images", value, "[v, h, w, 3 or 4]")
     if len(listed) < 2:
         raise refuse("images", "at least 2", len(listed))
-    outlines: list[Any] = [None] * len(listed)
+    given: list[Any] = [None] * len(listed)
     if masks is not None:
-        outlines = _listed("masks", masks, "[v, h, w]")
-        if len(outlines) != len(listed):
-            raise refuse("masks", f"one for each of {len(listed)} images", len(outlines))
+        given = _listed("masks", masks, "[v, h, w]")
+        if len(given) != len(listed):
+            raise refuse("masks", f"one for each of {len(listed)} images", len(given))
     result = []
-    for i, (one, outline) in enumerate(zip(listed, outlines)):
+    for i, (one, outline) in enumerate(zip(listed, given)):
         found = array(f"images[{i}]", one, expected="uint8, or floats from 0 to 1")
         if found.ndim != 3 or found.shape[2] not in (3, 4) or 0 in found.shape:
             raise refuse(f"images[{i}]", "the shape [h, w, 3] or [h, w, 4]", list(found.shape))

@@ -1,21 +1,51 @@
-"""Gaussians as arrays, their files and their pictures."""
+"""Gaussians as arrays, their files and renders."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
 from os import PathLike
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from . import _check, _core
-from ._check import Array, Floats
+from ._check import Array, Convention, Floats
 
-# Channels of a row: centre (3), log of the deviations (3), rotation w x y z (4), logit of the opacity, colour (3).
+# Channels of a row: center (3), log of the deviations (3), rotation w x y z (4), logit of the opacity, color (3).
 CHANNELS = 14
 # Opacities of 0 and 1 have no finite logit.
 OPACITY_MARGIN = 1e-6
+
+
+# Coefficients of a channel without the constant, by degree of the spherical harmonics.
+SH_COEFFICIENTS = (0, 3, 8, 15)
+
+
+class DroppedWarning(UserWarning):
+    """Something that was given is left out, or may make the result wrong."""
+
+
+def heed(notes: Iterable[tuple[bool, str]]) -> list[str]:
+    """The notes' sentences. Those of what is left out, or may be wrong, are warnings as well."""
+    told = list(notes)
+    for grave, text in told:
+        if grave:
+            # The caller of the package's function that calls this.
+            warnings.warn(text, DroppedWarning, stacklevel=3)
+    return [text for _, text in told]
+
+
+class Render(NamedTuple):
+    """Images of Gaussians: arrays of NumPy or tensors of PyTorch, as the Gaussians were. Without `v` for a single camera."""
+
+    #: Color over the background, `[v, h, w, 3]`, sRGB-encoded, not clamped.
+    rgb: Any
+    #: 1 - transmittance, `[v, h, w]`.
+    alpha: Any
+    #: Mean camera z of what is seen, `[v, h, w]`, in the cameras' units; 0 where nothing is. None unless asked for.
+    depth: Any = None
 
 
 def _of_bytes(data: bytearray, *shape: int) -> Floats:
@@ -31,9 +61,10 @@ class Gaussians:
     of them, `Gaussians(means, scales, quats, opacities, colors)`.
     """
 
-    __slots__ = ("_rows", "notes", "seconds", "seed", "up")
+    __slots__ = ("_rows", "_sh", "notes", "seconds", "seed", "up")
 
     _rows: Floats
+    _sh: Floats
     #: The direction of up in their frame: files that fix their own (.glb, .spz) are turned by it.
     up: tuple[float, float, float]
     #: What was understood of the photos or of the file, for you to read.
@@ -51,15 +82,25 @@ class Gaussians:
         opacities: Any,
         colors: Any,
         *,
+        sh: Any = None,
         up: Any = (0.0, 0.0, 1.0),
     ) -> None:
-        """Of arrays, as the properties of these names have them."""
-        means = _check.shaped("means", means, (None, 3), "[n, 3]")
+        """Makes Gaussians of arrays.
+
+        Args:
+            means: `[n, 3]`, centers.
+            scales: `[n, 3]`, standard deviations, above 0.
+            quats: `[n, 4]`, rotations w x y z of any length. `scales` and `quats` may be exchanged, as gsplat has them.
+            opacities: `[n]`, from 0 to 1.
+            colors: `[n, 3]`, sRGB-encoded, mostly from 0 to 1.
+            sh: `[n, k, 3]` with k of 3, 8 or 15, spherical harmonics of degree 1 to 3 (gsplat's `shN`); none by default.
+            up: the direction of up in their frame.
+
+        Raises:
+            ValueError, TypeError: the field, what was expected and what was found.
+        """
+        means, scales, quats, opacities, colors = _check.gaussians(means, scales, quats, opacities, colors)
         n = len(means)
-        scales = _check.shaped("scales", scales, (n, 3), f"[{n}, 3]")
-        quats = _check.shaped("quats", quats, (n, 4), f"[{n}, 4]")
-        opacities = _check.shaped("opacities", opacities, (n,), f"[{n}]")
-        colors = _check.shaped("colors", colors, (n, 3), f"[{n}, 3]")
         if n and not scales.min() > 0.0:
             raise _check.refuse("scales", "numbers above 0", scales.min())
         if n and (opacities.min() < 0.0 or opacities.max() > 1.0):
@@ -74,23 +115,41 @@ class Gaussians:
         rows[:, 6:10] = quats
         rows[:, 10] = np.log(opacities / (1.0 - opacities))
         rows[:, 11:14] = colors
-        self._set(rows, up=_check.point("up", up))
+        self._set(rows, _check.harmonics(sh, n), up=_check.point("up", up))
 
     def _set(
         self,
         rows: Floats,
+        sh: Floats | None = None,
         *,
         up: tuple[float, float, float] = (0.0, 0.0, 1.0),
         notes: Iterable[str] = (),
         seconds: Iterable[tuple[str, float]] = (),
         seed: int | None = None,
     ) -> None:
-        self._rows, self.up, self.notes, self.seconds, self.seed = rows, up, list(notes), dict(seconds), seed
+        self._rows = rows
+        self._sh = np.empty((len(rows), 0, 3), dtype=np.float32) if sh is None else sh
+        self.up, self.notes, self.seconds, self.seed = up, list(notes), dict(seconds), seed
 
     @classmethod
-    def _of(cls, data: bytearray, **told: Any) -> Gaussians:
+    def _of(cls, data: bytearray, sh: Floats | None = None, **told: Any) -> Gaussians:
         made = cls.__new__(cls)
-        made._set(_of_bytes(data, -1, CHANNELS), **told)
+        made._set(_of_bytes(data, -1, CHANNELS), sh, **told)
+        return made
+
+    @classmethod
+    def _of_splats(cls, splats: tuple[bytearray, int, bytearray], **told: Any) -> Gaussians:
+        data, degree, harmonics = splats
+        sh = _of_bytes(harmonics, -1, SH_COEFFICIENTS[degree], 3) if degree else None
+        return cls._of(data, sh, **told)
+
+    def _splats(self) -> tuple[bytes, int, bytes]:
+        return self._rows.tobytes(), self.sh_degree, self._sh.tobytes()
+
+    def _like(self, rows: Floats, sh: Floats) -> Gaussians:
+        """Others, in the same frame and of the same origin."""
+        made = Gaussians.__new__(Gaussians)
+        made._set(rows, sh, up=self.up, notes=self.notes, seconds=self.seconds.items(), seed=self.seed)
         return made
 
     @classmethod
@@ -103,31 +162,109 @@ class Gaussians:
 
     @classmethod
     def read(cls, path: str | PathLike[str], *, up: Any = (0.0, 0.0, 1.0)) -> Gaussians:
-        """From a .ply, .splat, .spz, .sog, .glb, or an .html that this program wrote.
+        """Reads a .ply, .splat, .spz, .sog, .glb, .gltf, .usda or .usdz, or an .html that this program wrote.
 
-        `up`: the direction of up in the frame that you want; .glb and .spz, which have +y up, are turned into it.
+        Args:
+            path: the file.
+            up: the direction of up in the frame that you want. Formats that fix theirs, as .glb, are turned into it.
+
+        Warns:
+            DroppedWarning: something of the file is left out.
         """
         direction = _check.point("up", up)
-        data, notes = _core.read_gaussians(path, direction)
-        return cls._of(data, up=direction, notes=notes)
+        splats, notes = _core.read_gaussians(path, direction)
+        return cls._of_splats(splats, up=direction, notes=heed(notes))
+
+    @classmethod
+    def concat(cls, parts: Iterable[Gaussians]) -> Gaussians:
+        """All of several, one after the other, in the frame of the first. Harmonics get the highest degree of all."""
+        listed = list(parts)
+        if not listed:
+            raise _check.refuse("parts", "one or more Gaussians", "none")
+        for i, part in enumerate(listed):
+            if not isinstance(part, Gaussians):
+                raise _check.wrong_type(f"parts[{i}]", "Gaussians", type(part).__name__)
+        k = max(part._sh.shape[1] for part in listed)
+        sh = np.concatenate([np.pad(part._sh, ((0, 0), (0, k - part._sh.shape[1]), (0, 0))) for part in listed])
+        return listed[0]._like(np.concatenate([part._rows for part in listed]), sh)
 
     def __len__(self) -> int:
         return len(self._rows)
 
+    def __getitem__(self, index: Any) -> Gaussians:
+        """Some of them: by a number, a slice, numbers, or a mask, as an array's rows."""
+        if isinstance(index, (int, np.integer)) and not isinstance(index, bool):
+            if not -len(self) <= index < len(self):
+                raise IndexError(f"Gaussian {index} of {len(self)}")
+            index = [index]
+        elif not isinstance(index, slice):
+            index = _check.indices(index, len(self))
+        return self._like(self._rows[index].copy(), self._sh[index].copy())
+
+    def __iter__(self) -> Iterator[Gaussians]:
+        return (self[i] for i in range(len(self)))
+
+    def __add__(self, other: Gaussians) -> Gaussians:
+        return Gaussians.concat([self, other]) if isinstance(other, Gaussians) else NotImplemented
+
+    def crop(self, low: Any, high: Any) -> Gaussians:
+        """Those whose centers lie in the box from `low` to `high`, each `[3]`, in their frame."""
+        least, most = np.array(_check.point("low", low)), np.array(_check.point("high", high))
+        if not (least < most).all():
+            raise _check.refuse("high", f"a corner above low, {least.tolist()}", most.tolist())
+        return self[((self._rows[:, 0:3] >= least) & (self._rows[:, 0:3] <= most)).all(axis=1)]
+
+    def transform(self, matrix: Any) -> Gaussians:
+        """Moved by a similarity, `[4, 4]` or `[3, 4]`: a rotation times a scale, and a translation. Harmonics and up turn with them."""
+        scale, rotation, quat, translation = _check.similarity("matrix", matrix)
+        moved = Gaussians._of_splats(_core.transform(*self._splats(), scale, quat, translation))
+        made = self._like(moved._rows, moved._sh)
+        x, y, z = (rotation @ np.array(self.up)).tolist()
+        made.up = (x, y, z)
+        return made
+
+    def to_torch(self, device: Any = "cpu") -> dict[str, Any]:
+        """Tensors under gsplat's names: `means`, `quats`, `scales`, `opacities`, `colors`, float32.
+
+        `gsplat.rasterization(**g.to_torch("cuda"), viewmats=..., Ks=..., width=..., height=...)` draws them. With spherical
+        harmonics `colors` holds all coefficients, `[n, 1 + k, 3]`: give `sh_degree=g.sh_degree` as well.
+        """
+        import torch
+
+        colors = self.colors
+        if self.sh_degree:
+            # gsplat, as 3DGS, adds 0.5 to what the constant 0.282 of degree 0 gives.
+            constant = (colors[:, None] - np.float32(0.5)) / np.float32(0.28209479177387814)
+            colors = np.concatenate([constant, self._sh], axis=1)
+        fields = {"means": self.means, "quats": self.quats, "scales": self.scales}
+        fields |= {"opacities": self.opacities, "colors": colors}
+        return {name: torch.from_numpy(value).to(device) for name, value in fields.items()}
+
     def __repr__(self) -> str:
-        return f"<freerange.Gaussians: {len(self)}>"
+        degree = f", spherical harmonics of degree {self.sh_degree}" if self.sh_degree else ""
+        return f"<freerange.Gaussians: {len(self)}{degree}>"
 
     def __reduce__(self) -> Any:
-        return _restored, (self._rows, self.up, self.notes, self.seconds, self.seed)
+        return _restored, (self._rows, self._sh, self.up, self.notes, self.seconds, self.seed)
+
+    @property
+    def sh(self) -> Floats:
+        """`[n, k, 3]`: spherical harmonics of degree 1 and up, 3DGS's basis; k is 0, 3, 8 or 15. Results of models have none."""
+        return self._sh.copy()
+
+    @property
+    def sh_degree(self) -> int:
+        """0 to 3; 0: color is the same from everywhere."""
+        return SH_COEFFICIENTS.index(self._sh.shape[1])
 
     @property
     def rows(self) -> Floats:
-        """`[n, 14]`: centre, natural log of the deviations, rotation w x y z, logit of the opacity, colour."""
+        """`[n, 14]`: center, natural log of the deviations, rotation w x y z, logit of the opacity, color."""
         return self._rows.copy()
 
     @property
     def means(self) -> Floats:
-        """`[n, 3]`: centres, in the lengths of the cameras' frame."""
+        """`[n, 3]`: centers, in the lengths of the cameras' frame."""
         return self._rows[:, 0:3].copy()
 
     @property
@@ -156,44 +293,52 @@ class Gaussians:
         """`[n, 3]`: red, green, blue, sRGB-encoded as in image files; mostly from 0 to 1, not clamped."""
         return self._rows[:, 11:14].copy()
 
-    def save(self, path: str | PathLike[str]) -> list[str]:
-        """Writes .ply, .splat, .spz, .sog, .glb or .html (a page that shows them), by the extension.
+    def save(self, path: str | PathLike[str]) -> None:
+        """Writes .ply, .splat, .spz, .sog, .glb, .usda, .usdz or .html (a page that shows them), by the extension.
 
-        Returns what the format could not hold, a sentence each.
+        Warns:
+            DroppedWarning: the format cannot hold something, a sentence each.
         """
-        return _core.write_gaussians(self._rows.tobytes(), path, self.up)
+        heed(_core.write_gaussians(*self._splats(), path, self.up))
 
     def render(
         self,
-        c2w: Any,
-        K: Any,
-        width: int,
-        height: int,
+        c2w: Any = None,
+        K: Any = None,
+        width: int = 512,
+        height: int = 512,
         background: Any = 1.0,
         *,
-        convention: str = "opencv",
-    ) -> Floats:
-        """Pictures of them: `float32`, `[h, w, 3]`, or `[v, h, w, 3]` for `c2w [v, 4, 4]` and `K [v, 3, 3]`.
+        viewmats: Any = None,
+        Ks: Any = None,
+        convention: Convention = "opencv",
+        depth: bool = False,
+    ) -> Render:
+        """Images of them, `float32` arrays; color follows the viewing direction where there are spherical harmonics.
 
-        Colours are those of image files (sRGB-encoded) and not clamped. `background`: a number, a colour, or one per view.
-        See `freerange.render` for cameras and for gradients.
+        Args: as `freerange.render`, without the Gaussians' own arrays.
         """
-        rgb, _ = _render(self._rows, c2w, K, width, height, background, convention)
-        return rgb
+        poses, k = _check.cameras_given(c2w, viewmats, K, Ks, "K")
+        return _render(self, poses, k, width, height, background, convention, depth)
 
 
 def _restored(
-    rows: Floats, up: tuple[float, float, float], notes: list[str], seconds: dict[str, float], seed: int | None
+    rows: Floats,
+    sh: Floats,
+    up: tuple[float, float, float],
+    notes: list[str],
+    seconds: dict[str, float],
+    seed: int | None,
 ) -> Gaussians:
     made = Gaussians.__new__(Gaussians)
-    made._set(rows, up=up, notes=notes, seconds=seconds.items(), seed=seed)
+    made._set(rows, sh, up=up, notes=notes, seconds=seconds.items(), seed=seed)
     return made
 
 
 def raw_cameras(
     c2w: Any, K: Any, width: int, height: int, background: Any, convention: str
 ) -> tuple[list[_check.RawCamera], list[tuple[float, float, float]], bool]:
-    """Cameras and backgrounds for the rasteriser, and whether it was a single camera."""
+    """Cameras and backgrounds for the rasterizer, and whether it was a single camera."""
     size = (_check.count("width", width, 1, 16384), _check.count("height", height, 1, 16384))
     poses, k = _check.array("c2w", c2w), _check.array("K", K)
     single = poses.ndim == 2
@@ -208,13 +353,29 @@ def raw_cameras(
 
 
 def _render(
-    rows: Floats, c2w: Any, K: Any, width: int, height: int, background: Any, convention: str
-) -> tuple[Floats, Floats]:
+    gaussians: Gaussians, c2w: Any, K: Any, width: int, height: int, background: Any, convention: str, depth: bool
+) -> Render:
     cameras, backgrounds, single = raw_cameras(c2w, K, width, height, background, convention)
-    rendered = _core.rasterize(rows.tobytes(), cameras, backgrounds)
-    rgb = _of_bytes(rendered.rgb(), len(cameras), height, width, 3)
-    alpha = _of_bytes(rendered.alpha(), len(cameras), height, width)
-    return (rgb[0], alpha[0]) if single else (rgb, alpha)
+    if gaussians.sh_degree:
+        # Colors differ from camera to camera.
+        eyes = [tuple(row[3] for row in camera[3][:3]) for camera in cameras]
+        seen = [_core.seen_from(*gaussians._splats(), eye) for eye in eyes]  # type: ignore[arg-type]
+        parts = [_core.rasterize(bytes(r), [c], [b], depth) for r, c, b in zip(seen, cameras, backgrounds)]
+    else:
+        parts = [_core.rasterize(gaussians._rows.tobytes(), cameras, backgrounds, depth)]
+
+    def joined(arrays: Sequence[bytearray], *shape: int) -> Floats:
+        return np.concatenate([_of_bytes(a, -1, height, width, *shape) for a in arrays])
+
+    rgb = joined([part.rgb() for part in parts], 3)
+    alpha = joined([part.alpha() for part in parts])
+    mean = None
+    if depth:
+        z = joined([part.depth() for part in parts])
+        mean = np.divide(z, alpha, out=np.zeros_like(z), where=alpha > 0.0)
+    if single:
+        return Render(rgb[0], alpha[0], None if mean is None else mean[0])
+    return Render(rgb, alpha, mean)
 
 
 def render(
@@ -223,39 +384,57 @@ def render(
     quats: Any,
     opacities: Any,
     colors: Any,
-    c2w: Any,
-    K: Any,
-    width: int,
-    height: int,
+    c2w: Any = None,
+    K: Any = None,
+    width: int = 512,
+    height: int = 512,
     background: Any = 1.0,
     *,
-    convention: str = "opencv",
-) -> tuple[Any, Any]:
-    """Renders Gaussians: colour over the background, `[v, h, w, 3]`, and alpha, `[v, h, w]`; without v for one camera.
+    viewmats: Any = None,
+    Ks: Any = None,
+    convention: Convention = "opencv",
+    depth: bool = False,
+) -> Render:
+    """Renders Gaussians on the CPU: color over the background, alpha, and depth if asked for.
 
-    Arrays as `Gaussians` has them. Of PyTorch tensors the results are tensors that can be differentiated in all five and in the
-    background (once); the work is done on the CPU. Of NumPy arrays they are `float32` arrays.
+    Of PyTorch tensors the results are tensors that can be differentiated in all five arrays and in the background (once). Of NumPy
+    arrays they are `float32` arrays.
 
-    `c2w`: camera to world, `[4, 4]` or `[v, 4, 4]` (a fourth row may be left out), in OpenCV's axes (x right, y down, z forward), or with
-    `convention="opengl"` in OpenGL's and Blender's (y up, z backward). `K`: in pixels; the centre of the first pixel lies at 0.5.
+    Args:
+        means, scales, quats, opacities, colors: as `Gaussians` has them; gsplat's order (means, quats, scales, ...) is
+            known by the shapes.
+        c2w: camera to world, `[4, 4]` or `[v, 4, 4]`; a fourth row may be left out. OpenCV's axes: x right, y down, z forward.
+        K: `[3, 3]` or `[v, 3, 3]`, in pixels; the center of the first pixel is at 0.5.
+        width, height: in pixels.
+        background: a number, a color `[3]`, or one for each view.
+        viewmats: world to camera instead of `c2w`, as gsplat has it.
+        Ks: the same as `K`.
+        convention: "opengl" for OpenGL's and Blender's axes (y up, z backward).
+        depth: whether the depth is computed.
+
+    Raises:
+        ValueError, TypeError: the field, what was expected and what was found.
     """
-    arrays = (means, scales, quats, opacities, colors)
+    poses, k = _check.cameras_given(c2w, viewmats, K, Ks, "K")
     torch = sys.modules.get("torch")
-    if torch is not None and any(isinstance(a, torch.Tensor) for a in (*arrays, background)):
+    if torch is not None and any(isinstance(a, torch.Tensor) for a in (means, scales, quats, opacities, colors, background)):
         from .torch import render as differentiable
 
-        return differentiable(*arrays, c2w, K, width, height, background, convention=convention)
-    return _render(Gaussians(*arrays)._rows, c2w, K, width, height, background, convention)
+        return differentiable(
+            means, scales, quats, opacities, colors, poses, k, width, height, background, convention=convention, depth=depth
+        )
+    made = Gaussians(means, scales, quats, opacities, colors)
+    return _render(made, poses, k, width, height, background, convention, depth)
 
 
 def views_of(
     told: list[tuple[str, tuple[int, int, tuple[float, ...], list[list[float]]], bytearray]],
 ) -> tuple[list[str], list[Array], Array, Array]:
-    """Names, RGBA pictures, intrinsics and poses of views that the part in Rust told of."""
-    names, pictures, intrinsics, poses = [], [], [], []
+    """Names, RGBA images, intrinsics and poses of views that the part in Rust told of."""
+    names, images, intrinsics, poses = [], [], [], []
     for name, (width, height, (fx, fy, cx, cy), c2w), rgba in told:
         names.append(name)
-        pictures.append(np.frombuffer(rgba, dtype=np.uint8).reshape(height, width, 4))
+        images.append(np.frombuffer(rgba, dtype=np.uint8).reshape(height, width, 4))
         intrinsics.append([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         poses.append(c2w)
-    return names, pictures, np.array(intrinsics).reshape(-1, 3, 3), np.array(poses).reshape(-1, 4, 4)
+    return names, images, np.array(intrinsics).reshape(-1, 3, 3), np.array(poses).reshape(-1, 4, 4)

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
-from typing import Any, overload
+from typing import Any, Literal, overload
 
 import numpy as np
 
 from . import _check, _core
-from ._gaussians import Gaussians
+from ._check import Convention
+from ._gaussians import Gaussians, heed
 from ._scene import Scene
+
+Quality = Literal["draft", "default", "high"]
+Detect = Literal["auto", "off"]
+Init = Literal["fit", "flow"]
+Precision = Literal["f32", "bf16", "f16", "auto"]
 
 
 @dataclass(frozen=True)
@@ -43,10 +49,16 @@ def load(
     device: str = "auto",
     encoder_weights: str | PathLike[str] | None = None,
 ) -> Model:
-    """A model, ready for one object after the other.
+    """Loads a model, ready for one object after the other.
 
-    `checkpoint`: a file, `hf:owner/name[@revision]` for one on the Hugging Face hub, or none for the one in this package. `device`:
-    "auto", "cpu", or what `freerange.devices()` lists. `encoder_weights`: the folder of a frozen encoder's published weights.
+    Args:
+        checkpoint: a file, `hf:owner/name[@revision]` for one on the Hugging Face hub, or None for the bundled one.
+        device: "auto", "cpu", or what `freerange.devices()` lists.
+        encoder_weights: the folder of a frozen encoder's published weights.
+
+    Raises:
+        ValueError, OSError: a name that is none, a file that cannot be read.
+        RuntimeError: a device that cannot be opened.
     """
     return Model(_core.load(checkpoint, device, encoder_weights))
 
@@ -86,101 +98,203 @@ class Model:
 
     @overload
     def reconstruct(
-        self, images: Any, intrinsics: Any, c2w: Any, masks: Any = None, *, seed: int = 0, **options: Any
+        self,
+        images: Any,
+        intrinsics: Any = None,
+        c2w: Any = None,
+        masks: Any = None,
+        *,
+        viewmats: Any = None,
+        Ks: Any = None,
+        convention: Convention = "opencv",
+        up: Any = "z",
+        center: Any = None,
+        radius: float | None = None,
+        seed: int = 0,
+        quality: Quality = "default",
+        iterations: int | None = None,
+        symmetry: Detect | None = None,
+        init: Init | None = None,
+        precision: Precision | None = None,
+        network_views: int | None = None,
+        set: Mapping[str, object] | None = None,
+        on_step: OnStep | None = None,
     ) -> Gaussians: ...
     @overload
     def reconstruct(
-        self, images: Any, intrinsics: Any, c2w: Any, masks: Any = None, *, seed: Sequence[int], **options: Any
+        self,
+        images: Any,
+        intrinsics: Any = None,
+        c2w: Any = None,
+        masks: Any = None,
+        *,
+        viewmats: Any = None,
+        Ks: Any = None,
+        convention: Convention = "opencv",
+        up: Any = "z",
+        center: Any = None,
+        radius: float | None = None,
+        seed: Sequence[int],
+        quality: Quality = "default",
+        iterations: int | None = None,
+        symmetry: Detect | None = None,
+        init: Init | None = None,
+        precision: Precision | None = None,
+        network_views: int | None = None,
+        set: Mapping[str, object] | None = None,
+        on_step: OnStep | None = None,
     ) -> list[Gaussians]: ...
     def reconstruct(
         self,
         images: Any,
-        intrinsics: Any,
-        c2w: Any,
+        intrinsics: Any = None,
+        c2w: Any = None,
         masks: Any = None,
         *,
-        seed: int | Sequence[int] = 0,
-        convention: str = "opencv",
+        viewmats: Any = None,
+        Ks: Any = None,
+        convention: Convention = "opencv",
         up: Any = "z",
         center: Any = None,
         radius: float | None = None,
+        seed: int | Sequence[int] = 0,
+        quality: Quality = "default",
+        iterations: int | None = None,
+        symmetry: Detect | None = None,
+        init: Init | None = None,
+        precision: Precision | None = None,
+        network_views: int | None = None,
+        set: Mapping[str, object] | None = None,
         on_step: OnStep | None = None,
-        **options: Any,
     ) -> Gaussians | list[Gaussians]:
         """Reconstructs an object from two or more posed images of it.
 
-        `images`: `[v, h, w, 3]` or `[v, h, w, 4]` (alpha is the object's mask), `uint8` or floats from 0 to 1, sRGB-encoded; a
-        sequence where their sizes differ. `intrinsics`: `[v, 3, 3]`, in pixels; the centre of the first pixel lies at 0.5. `c2w`: camera to
-        world, `[v, 4, 4]` or `[v, 3, 4]`, in OpenCV's axes (x right, y down, z forward), or with `convention="opengl"` in OpenGL's and
-        Blender's (y up, z backward). `masks`: `[v, h, w]`, bool, `uint8` or floats, white is the object; without them and without alpha
-        a plain background is cut away, else poses and colours tell the object (`notes` of the result says how sure).
+        Args:
+            images: `[v, h, w, 3]` or `[v, h, w, 4]` (alpha is the object's mask), `uint8` or floats from 0 to 1,
+                sRGB-encoded; a sequence where their sizes differ.
+            intrinsics: `[v, 3, 3]`, in pixels; the center of the first pixel is at 0.5.
+            c2w: camera to world, `[v, 4, 4]` or `[v, 3, 4]`, in OpenCV's axes (x right, y down, z forward).
+            masks: `[v, h, w]`, bool, `uint8` or floats; white is the object. Without them and without alpha a plain
+                background is cut away, else poses and colors show the object (`notes` of the result says how sure).
+            viewmats: world to camera instead of `c2w`, as gsplat has it.
+            Ks: the same as `intrinsics`.
+            convention: "opengl" for OpenGL's and Blender's axes (y up, z backward).
+            up: which way is up in the cameras' frame: "z", "y", "cameras" or a direction.
+            center, radius: where the object is, if that is known.
+            seed: a number, or several for a list of as many samples.
+            quality: "draft", "default" or "high"; the options that follow are the preset's if they are None.
+            iterations: steps of the optimization on the photos.
+            symmetry: "auto" or "off".
+            init: "fit" or "flow", where the proposals come from.
+            precision: of the network: "f32", "bf16", "f16" or "auto".
+            network_views: most images that the network sees.
+            set: further fields of the pipeline by their paths, as in `{"propose.count": 2}`.
+            on_step: called with a `Step` after each. What it raises ends the work, as Ctrl-C does.
 
-        `seed`: an integer, or several for a list of as many samples (drawn together, they differ in rounding from one alone). `up`: which way is up in the cameras' frame: "z", "y", "cameras" or a
-        direction. `center`, `radius`: where the object is, if that is known. `on_step`: called with a `Step` after each; what it
-        raises ends the work, as Ctrl-C does.
+        Returns:
+            Gaussians in the cameras' frame; a list of them where `seed` is several.
 
-        Further options are those of the command line: `quality` ("draft", "default" or "high"), `iterations`, `symmetry` ("auto" or
-        "off"), `init` ("fit" or "flow"), `precision`, `network_views`, and `set`, a dictionary of further fields by their paths, as in
-        `set={"propose.count": 2}`.
+        Raises:
+            ValueError, TypeError: the field, what was expected and what was found.
+            RuntimeError: a device or the arithmetic failed.
+
+        Warns:
+            DroppedWarning: something given is left out, or may make the result wrong.
         """
-        seeds, chosen = _options(seed, options)
-        pictures = _check.images(images, masks)
-        sizes = [(picture.shape[1], picture.shape[0]) for picture in pictures]
-        cameras = _check.cameras(c2w, intrinsics, sizes, convention, "intrinsics")
-        views = [(f"images[{i}]", camera, p.tobytes()) for i, (camera, p) in enumerate(zip(cameras, pictures))]
+        poses, k = _check.cameras_given(c2w, viewmats, intrinsics, Ks, "intrinsics")
+        seeds, chosen = _options(seed, quality, iterations, symmetry, init, precision, network_views, set)
+        rgba = _check.images(images, masks)
+        sizes = [(image.shape[1], image.shape[0]) for image in rgba]
+        cameras = _check.cameras(poses, k, sizes, convention, "intrinsics" if Ks is None else "Ks")
+        views = [(f"images[{i}]", camera, p.tobytes()) for i, (camera, p) in enumerate(zip(cameras, rgba))]
         center = None if center is None else _check.point("center", center)
         radius = None if radius is None else _check.number("radius", radius)
         result = self._model.reconstruct(views, chosen, _check.up(up), center, radius, _told(on_step))
-        return _made(result, seeds, seed)
+        return _made(result, heed(result[2]), seeds, seed)
 
     @overload
-    def reconstruct_scene(self, scene: Scene | str | PathLike[str], *, seed: int = 0, **options: Any) -> Gaussians: ...
+    def reconstruct_scene(
+        self,
+        scene: Scene | str | PathLike[str],
+        *,
+        seed: int = 0,
+        quality: Quality = "default",
+        iterations: int | None = None,
+        symmetry: Detect | None = None,
+        init: Init | None = None,
+        precision: Precision | None = None,
+        network_views: int | None = None,
+        set: Mapping[str, object] | None = None,
+        on_step: OnStep | None = None,
+    ) -> Gaussians: ...
     @overload
     def reconstruct_scene(
-        self, scene: Scene | str | PathLike[str], *, seed: Sequence[int], **options: Any
+        self,
+        scene: Scene | str | PathLike[str],
+        *,
+        seed: Sequence[int],
+        quality: Quality = "default",
+        iterations: int | None = None,
+        symmetry: Detect | None = None,
+        init: Init | None = None,
+        precision: Precision | None = None,
+        network_views: int | None = None,
+        set: Mapping[str, object] | None = None,
+        on_step: OnStep | None = None,
     ) -> list[Gaussians]: ...
     def reconstruct_scene(
         self,
         scene: Scene | str | PathLike[str],
         *,
         seed: int | Sequence[int] = 0,
+        quality: Quality = "default",
+        iterations: int | None = None,
+        symmetry: Detect | None = None,
+        init: Init | None = None,
+        precision: Precision | None = None,
+        network_views: int | None = None,
+        set: Mapping[str, object] | None = None,
         on_step: OnStep | None = None,
-        **options: Any,
     ) -> Gaussians | list[Gaussians]:
-        """Reconstructs a scene, or the folder of one: to the byte what the command line makes of it. Options as `reconstruct`."""
-        seeds, chosen = _options(seed, options)
+        """Reconstructs a scene, or the folder of one: to the byte what the command line makes of it.
+
+        Args:
+            scene: a `Scene`, or what `Scene.read` reads.
+            seed, quality, iterations, symmetry, init, precision, network_views, set, on_step: as `reconstruct`.
+        """
+        seeds, chosen = _options(seed, quality, iterations, symmetry, init, precision, network_views, set)
         if not isinstance(scene, Scene):
             scene = Scene.read(scene)
-        return _made(self._model.reconstruct_scene(scene._scene, chosen, _told(on_step)), seeds, seed)
+        result = self._model.reconstruct_scene(scene._scene, chosen, _told(on_step))
+        return _made(result, heed(result[2]), seeds, seed)
 
 
-_COUNTS = {"iterations": 0, "network_views": 1}
-_NAMES = ("quality", "symmetry", "init", "precision")
-
-
-def _options(seed: int | Sequence[int], options: dict[str, Any]) -> tuple[list[int], dict[str, Any]]:
-    """Seeds, and every option; those that are not given are `None`."""
-    known = (*_NAMES, *_COUNTS, "set")
-    for name in options:
-        if name not in known:
-            raise TypeError(f"{name}: expected one of the options {', '.join(known)}, found another name")
+def _options(
+    seed: int | Sequence[int],
+    quality: str,
+    iterations: int | None,
+    symmetry: str | None,
+    init: str | None,
+    precision: str | None,
+    network_views: int | None,
+    fields: Mapping[str, object] | None,
+) -> tuple[list[int], dict[str, Any]]:
+    """Seeds, and every option; those that are not given are None."""
     given = list(seed) if isinstance(seed, (Sequence, np.ndarray)) else [seed]
     seeds = [_check.count("seed", s, 0, 2**64 - 1) for s in given]
     if not 1 <= len(seeds) <= 64:
         raise _check.refuse("seed", "an integer or 1 to 64 of them", f"{len(seeds)} of them")
-    fields = options.get("set") or {}
-    if not isinstance(fields, dict) or not all(isinstance(key, str) for key in fields):
+    if fields is not None and not (isinstance(fields, Mapping) and all(isinstance(key, str) for key in fields)):
         raise _check.wrong_type("set", "a dictionary of names and values", f"{fields!r}")
-    chosen: dict[str, Any] = {"seeds": seeds, "set": [(key, json.dumps(value)) for key, value in fields.items()]}
-    for name in (*_NAMES, *_COUNTS):
-        value = options.get(name)
-        if value is None:
-            pass
-        elif name in _COUNTS:
-            value = _check.count(name, value, _COUNTS[name], 2**31)
-        elif not isinstance(value, str):
+    names = {"quality": quality, "symmetry": symmetry, "init": init, "precision": precision}
+    for name, value in names.items():
+        if value is not None and not isinstance(value, str):
             raise _check.wrong_type(name, "a name", f"{value!r}")
-        chosen[name] = value
+    counts = {"iterations": (iterations, 0), "network_views": (network_views, 1)}
+    chosen: dict[str, Any] = {"seeds": seeds, **names}
+    chosen["set"] = [(key, json.dumps(value)) for key, value in (fields or {}).items()]
+    for name, (number, least) in counts.items():
+        chosen[name] = None if number is None else _check.count(name, number, least, 2**31)
     return seeds, chosen
 
 
@@ -196,7 +310,7 @@ def _told(on_step: OnStep | None) -> Any:
     return told
 
 
-def _made(result: Any, seeds: list[int], seed: int | Sequence[int]) -> Gaussians | list[Gaussians]:
-    samples, up, notes, seconds = result
+def _made(result: Any, notes: list[str], seeds: list[int], seed: int | Sequence[int]) -> Gaussians | list[Gaussians]:
+    samples, up, _, seconds = result
     made = [Gaussians._of(s, up=tuple(up), notes=notes, seconds=seconds, seed=n) for s, n in zip(samples, seeds)]
     return made if isinstance(seed, (Sequence, np.ndarray)) else made[0]

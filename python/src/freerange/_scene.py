@@ -1,56 +1,81 @@
-"""Scenes on disk."""
+"""Scenes: photos with cameras."""
 
 from __future__ import annotations
 
+import tempfile
+from collections.abc import Sequence
 from os import PathLike, fspath
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import numpy as np
 
 from . import _check, _core
-from ._check import Array
-from ._gaussians import views_of
+from ._check import Array, Convention
+from ._gaussians import heed, views_of
 
+Masks = Literal["auto", "alpha", "plain", "estimate"]
+CameraFormat = Literal["transforms", "colmap", "polycam", "metashape", "realitycapture", "opf"]
 _MASKS = ("auto", "alpha", "plain", "estimate")
 
 
 class Scene:
-    """Photos with cameras, freed of their lenses and cut out.
+    """Photos with cameras, undistorted and cut out.
 
-    `names`, `images` (a list of `uint8 [h, w, 4]`, alpha is the object's mask), `intrinsics [v, 3, 3]` and `c2w [v, 4, 4]` (OpenCV's axes)
-    of the views to reconstruct from; `further` the same of views that are only compared with, if the scene has such.
+    Made by `Scene.read` from a folder, `Scene.from_arrays` from arrays, `Scene.from_pycolmap` from a reconstruction in memory;
+    `Model.reconstruct_scene` takes it.
     """
 
     _scene: _core.Scene
+    #: Names of the photos.
     names: list[str]
+    #: `uint8 [h, w, 4]` each; alpha is the object's mask.
     images: list[Array]
+    #: `[v, 3, 3]`, in pixels; the center of the first pixel is at 0.5.
     intrinsics: Array
+    #: `[v, 4, 4]`, camera to world, OpenCV's axes (x right, y down, z forward).
     c2w: Array
-    #: Names, images, intrinsics, c2w.
+    #: The same four of photos that are only compared with, if the scene has such.
     further: tuple[list[str], list[Array], Array, Array]
     #: What was understood, for you to read.
     notes: list[str]
 
     def __init__(self) -> None:
-        raise TypeError("freerange.Scene is read from disk: Scene.read(path); views in memory go to Model.reconstruct")
+        raise TypeError("freerange.Scene is made by Scene.read(path), Scene.from_arrays(...) or Scene.from_pycolmap(...)")
 
     @classmethod
     def read(
         cls,
         path: str | PathLike[str],
         *,
-        masks: str | PathLike[str] = "auto",
+        masks: Masks | str | PathLike[str] = "auto",
         invert_masks: bool = False,
         up: Any = "auto",
         center: Any = None,
         radius: float | None = None,
         max_side: int = 1024,
         images: str | PathLike[str] | None = None,
-        cameras: str | None = None,
+        cameras: CameraFormat | None = None,
         turntable: tuple[float, float] | str | None = None,
     ) -> Scene:
-        """Reads a folder (or file) of cameras and its photos; options as of `freerange reconstruct`.
+        """Reads a folder (or file) of cameras and its photos, as `freerange reconstruct` does.
 
-        `masks`: "alpha", "plain", "estimate", a folder of masks, or "auto", the first that is there. `up`: "z", "y", "cameras", a
-        direction, or "auto". `turntable`: elevation and field of view in degrees, of photos without cameras.
+        Args:
+            path: the folder, or the file of cameras.
+            masks: "alpha", "plain", "estimate", a folder of masks, or "auto", the first that is there.
+            invert_masks: in files of masks black is the object.
+            up: "z", "y", "cameras", a direction, or "auto", by the cameras' format.
+            center, radius: where the object is, if that is known.
+            max_side: longer sides of photos are shrunk to so many pixels.
+            images: where the photos are, if not where the cameras say.
+            cameras: the format, if the folder has several.
+            turntable: elevation and field of view in degrees, of photos without cameras, turned in even steps.
+
+        Raises:
+            ValueError, OSError: the file, the field, what was expected and what was found.
+
+        Warns:
+            DroppedWarning: something of the scene is left out, or may be wrong.
         """
         named = masks if isinstance(masks, str) and masks in _MASKS else None
         if isinstance(turntable, (tuple, list)):
@@ -66,12 +91,84 @@ class Scene:
             "center": None if center is None else _check.point("center", center),
             "radius": None if radius is None else _check.number("radius", radius),
         }
+        return cls._of(_core.read_scene(path, photos, _check.up(up)))
+
+    @classmethod
+    def from_arrays(
+        cls,
+        images: Any,
+        intrinsics: Any = None,
+        c2w: Any = None,
+        masks: Any = None,
+        *,
+        viewmats: Any = None,
+        Ks: Any = None,
+        names: Sequence[str] | None = None,
+        convention: Convention = "opencv",
+        up: Any = "z",
+        center: Any = None,
+        radius: float | None = None,
+    ) -> Scene:
+        """Makes a scene of arrays, and cuts the object out.
+
+        Args:
+            names: of the views, for messages; `images[0]` and so on by default.
+            images, intrinsics, c2w, masks, viewmats, Ks, convention, up, center, radius: as `Model.reconstruct`.
+
+        Raises:
+            ValueError, TypeError: the field, what was expected and what was found.
+        """
+        poses, k = _check.cameras_given(c2w, viewmats, intrinsics, Ks, "intrinsics")
+        rgba = _check.images(images, masks)
+        sizes = [(image.shape[1], image.shape[0]) for image in rgba]
+        raw = _check.cameras(poses, k, sizes, convention, "intrinsics" if Ks is None else "Ks")
+        called = [f"images[{i}]" for i in range(len(rgba))] if names is None else list(names)
+        if len(called) != len(rgba) or not all(isinstance(name, str) for name in called):
+            raise _check.refuse("names", f"a string for each of {len(rgba)} images", called)
+        views = [(name, camera, image.tobytes()) for name, camera, image in zip(called, raw, rgba)]
+        center = None if center is None else _check.point("center", center)
+        radius = None if radius is None else _check.number("radius", radius)
+        return cls._of(_core.scene_of_views(views, _check.up(up), center, radius))
+
+    @classmethod
+    def from_pycolmap(cls, reconstruction: Any, images: str | PathLike[str], **options: Any) -> Scene:
+        """Makes a scene of a `pycolmap.Reconstruction`: all camera models, with their distortion.
+
+        Args:
+            reconstruction: cameras and poses, in memory.
+            images: the folder of the photos, by the names that the reconstruction has.
+            options: as `Scene.read` has them.
+
+        Raises:
+            TypeError: it is no reconstruction.
+            ValueError, OSError: as `Scene.read`.
+        """
+        if not hasattr(reconstruction, "write"):
+            raise _check.wrong_type("reconstruction", "a pycolmap.Reconstruction", type(reconstruction).__name__)
+        with tempfile.TemporaryDirectory() as folder:
+            model = Path(folder) / "sparse" / "0"
+            model.mkdir(parents=True)
+            reconstruction.write(str(model))
+            return cls.read(folder, images=images, cameras="colmap", **options)
+
+    @classmethod
+    def _of(cls, scene: _core.Scene) -> Scene:
         made = cls.__new__(cls)
-        made._scene = _core.read_scene(path, photos, _check.up(up))
-        made.names, made.images, made.intrinsics, made.c2w = views_of(made._scene.views())
-        made.further = views_of(made._scene.further())
-        made.notes = made._scene.notes()
+        made._scene = scene
+        made.names, made.images, made.intrinsics, made.c2w = views_of(scene.views())
+        made.further = views_of(scene.further())
+        made.notes = heed(scene.notes())
         return made
+
+    @property
+    def viewmats(self) -> Array:
+        """`[v, 4, 4]`, world to camera, as gsplat and COLMAP have it."""
+        return cast(Array, np.linalg.inv(self.c2w))
+
+    @property
+    def Ks(self) -> Array:
+        """`intrinsics`, under gsplat's name."""
+        return self.intrinsics
 
     def __len__(self) -> int:
         return len(self.names)

@@ -88,7 +88,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
 fn print(args: &Args, found: &Inspection) {
     let shown = found.views.iter().filter(|v| v.shown).count();
     println!(
-        "{}: {} cameras, {} photos, {shown} shown to the model",
+        "{}: {} cameras, {} photos, {shown} seen by the network",
         args.scene.display(),
         found.format.name(),
         found.views.len()

@@ -54,7 +54,7 @@ pub struct Args {
     /// Separate several by commas. Meshes have vertex colors. colmap is a folder of photos, cameras, and the Gaussians' centers as points.
     #[arg(long, value_name = "FORMATS", value_delimiter = ',', value_parser = parse_written, help_heading = "Results")]
     format: Vec<Written>,
-    /// Number of results with different seeds; they differ most where no photo looks.
+    /// Number of results with different seeds. From initial fits they differ little; those of `--init flow` are samples.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64), hide_short_help = true, help_heading = "Results")]
     samples: u32,
     /// Print the report as JSON on standard output.

@@ -54,7 +54,7 @@ impl Gaussians {
     /// # Panics
     /// If the length is no multiple of 14: a programming error, as files are checked when they are read.
     pub fn from_rows(data: Vec<f32>) -> Self {
-        assert_eq!(data.len() % channel::COUNT, 0, "a cloud has {} channels per Gaussian", channel::COUNT);
+        assert_eq!(data.len() % channel::COUNT, 0, "{} channels per Gaussian", channel::COUNT);
         Self { data }
     }
 
@@ -85,7 +85,7 @@ impl Gaussians {
 
     /// The 14 channels of Gaussian `i`.
     pub fn row(&self, i: usize) -> &[f32; channel::COUNT] {
-        self.data.as_chunks::<{ channel::COUNT }>().0.get(i).expect("index within the cloud")
+        self.data.as_chunks::<{ channel::COUNT }>().0.get(i).expect("index of a Gaussian")
     }
 
     /// The Gaussians one after the other, 14 channels each.

@@ -122,9 +122,9 @@ fn view_reports(loaded: &Loaded, frame: &CanonicalFrame, shown: &[usize]) -> Vec
                 cut_off: estimate::cut_off(&alpha, c.width, c.height),
                 shown: is_shown,
                 reason: match (is_shown, shown.len() == loaded.views.len()) {
-                    (true, true) => "all views are shown to the model".into(),
+                    (true, true) => "the network sees all views".into(),
                     (true, false) => "stands for its side of the object (k-means of the cameras)".into(),
-                    (false, _) => "another view stands for its side; refinement looks at it".into(),
+                    (false, _) => "another view stands for its side; the optimization uses it".into(),
                 },
             }
         })
@@ -188,7 +188,7 @@ fn warnings(views: &[ViewReport], sureness: Option<f64>) -> Vec<String> {
         }
         if gap.0 > 220.0 {
             warnings.push(format!(
-                "all photos are taken from one side: nothing shows {:.0} degrees of the way around, the model will invent them",
+                "all photos are taken from one side: nothing shows {:.0} degrees of the way around, what is there will be a smooth guess",
                 gap.0
             ));
         } else if gap.0 > WIDE_GAP {
@@ -212,7 +212,7 @@ fn warnings(views: &[ViewReport], sureness: Option<f64>) -> Vec<String> {
             .push(format!("the object is small (less than a hundredth of the photo) in {names}: go nearer, or crop"));
     }
     if sureness.is_some_and(|s| s < 0.85) {
-        warnings.push("the masks are not sure: look at them, mend them and give them with --masks".into());
+        warnings.push("the masks are not sure: look at them, correct them and give them with --masks".into());
     }
     warnings
 }
@@ -243,7 +243,7 @@ pub fn sheet(loaded: &Loaded, inspection: &Inspection) -> Result<RgbaImage, Scen
     let mut sheet = RgbaImage::from_pixel(columns * TILE, head + rows * (TILE + 2 * LINE), WHITE);
     let sure = inspection.sureness.map_or(String::new(), |s| format!(", {:.0} % SURE", 100.0 * s));
     let title = format!(
-        "{}: {} PHOTOS, {} SHOWN TO THE MODEL, MASKS: {}{sure}",
+        "{}: {} PHOTOS, {} SEEN BY THE NETWORK, MASKS: {}{sure}",
         inspection.format.name(),
         inspection.views.len(),
         inspection.views.iter().filter(|v| v.shown).count(),
@@ -264,7 +264,7 @@ pub fn sheet(loaded: &Loaded, inspection: &Inspection) -> Result<RgbaImage, Scen
         let line = format!(
             "{place} {}: {} AGREES {:.0} %{}",
             report.name,
-            if report.shown { "SHOWN" } else { "NOT SHOWN" },
+            if report.shown { "SEEN BY THE NETWORK" } else { "FOR THE OPTIMIZATION" },
             100.0 * report.agreement,
             if report.cut_off { ", CUT OFF" } else { "" }
         );

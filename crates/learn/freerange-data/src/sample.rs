@@ -214,7 +214,7 @@ fn encode_gaussians(object: &Object, leaves: Option<&Gaussians>, place: EntryOfS
         for (name, cloud) in fit_names(i).into_iter().zip([&fit.gaussians, &fit.target]) {
             let halves: Vec<f16> = cloud.rows().iter().map(|v| f16::from_f32(*v)).collect();
             if let Some(bad) = halves.iter().position(|v| !v.is_finite()) {
-                return Err(place.error("quick fits of numbers that 16 bits hold", cloud.rows()[bad]));
+                return Err(place.error("initial fits of numbers that 16 bits hold", cloud.rows()[bad]));
             }
             let bytes = halves.iter().flat_map(|v| v.to_le_bytes()).collect();
             tensors.push((name, Dtype::F16, cloud.len(), bytes));

@@ -242,7 +242,7 @@ fn same_fit<'a>(
         fit.filter(enough).ok_or_else(|| TrainError::Fits {
             object: o.id.clone(),
             expected: format!(
-                "a quick fit number {number} of {} Gaussians and {count} views, and {held_views} views besides",
+                "an initial fit number {number} of {} Gaussians and {count} views, and {held_views} views besides",
                 1u64 << depth
             ),
             found: {

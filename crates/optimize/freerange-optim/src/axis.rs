@@ -1,4 +1,4 @@
-//! Axes about which an object may be turned, and keeps its outlines: each photo then tells them from where nobody stood.
+//! Axes about which an object may be turned, and keeps its silhouettes: each photo then tells them from where nobody stood.
 
 use std::{f64::consts::TAU, ops::ControlFlow};
 
@@ -7,7 +7,7 @@ use freerange_scene::camera::{Camera, View};
 use glam::{DMat4, DVec3};
 
 use crate::{
-    Evidence, FitError, InitialFitConfig, Outline,
+    Evidence, FitError, InitialFitConfig, Silhouette,
     search::{Hull, OUTLINE, PICTURE, ROUNDS, Search, Symmetry, UNCOVERED, difference, going_on, normals, place},
     views::Targets,
 };
@@ -60,12 +60,12 @@ impl Symmetry for Axis {
 pub struct FoundAxis {
     /// The axis.
     pub axis: Axis,
-    /// How unlike the photos' outlines those of a fit of photos and turned outlines are, as a part of how unlike those of a fit of the photos alone
-    /// are. The former has had twice the steps, half of them for outlines: well below 1 where turned outlines agree with the photos.
+    /// How unlike the photos' silhouettes those of a fit of photos and turned silhouettes are, as a part of how unlike those of a fit of the photos alone
+    /// are. The former has had twice the steps, half of them for silhouettes: well below 1 where turned silhouettes agree with the photos.
     pub contradiction: f64,
 }
 
-/// Axes that are put in place by outlines.
+/// Axes that are put in place by silhouettes.
 const PLACED: usize = 8;
 
 /// How many steps [`find_axis`] tells of.
@@ -73,13 +73,13 @@ pub fn axis_steps(config: &InitialFitConfig) -> usize {
     config.iterations + ROUNDS * going_on(config).iterations
 }
 
-/// The axis about which an object may be turned and keeps its outlines, as far as photos of it tell: none where they contradict it by more than
-/// `most` (see [`FoundAxis::contradiction`]), or no axis suits their outlines. Colors need not be the same all around. `views` lie in the
+/// The axis about which an object may be turned and keeps its silhouettes, as far as photos of it tell: none where they contradict it by more than
+/// `most` (see [`FoundAxis::contradiction`]), or no axis suits their silhouettes. Colors need not be the same all around. `views` lie in the
 /// canonical frame, and may all be from one side; `own` is a [`initial_fit`](crate::initial_fit) of them.
 ///
-/// What lies within all outlines, and within all turned ones, has to fill the outlines. Axes through the middle of the hull, in all directions,
-/// fifteen degrees apart: those that leave most of the outlines filled are moved to where they leave more. The best of them is moved to where that
-/// fit of the photos, then one of photos and turned outlines, looks most like the outlines when it is turned.
+/// What lies within all silhouettes, and within all turned ones, has to fill the silhouettes. Axes through the middle of the hull, in all directions,
+/// fifteen degrees apart: those that leave most of the silhouettes filled are moved to where they leave more. The best of them is moved to where that
+/// fit of the photos, then one of photos and turned silhouettes, looks most like the silhouettes when it is turned.
 /// `progress` hears how many of [`axis_steps`] are done, of some more than once, and ends the search, with none, by `ControlFlow::Break`.
 ///
 /// # Errors
@@ -93,8 +93,8 @@ pub fn find_axis(
     mut progress: impl FnMut(usize) -> ControlFlow<()>,
 ) -> Result<Option<FoundAxis>, FitError> {
     config.check()?;
-    let outlines = Targets::new(views, Some(OUTLINE))?;
-    let hull = Hull::new(&outlines);
+    let silhouettes = Targets::new(views, Some(OUTLINE))?;
+    let hull = Hull::new(&silhouettes);
     let mut search = Search { progress: &mut progress, seed, done: 0 };
     let uncovered = |axis: &Axis| {
         let turns: Vec<DMat4> = (1..TURNS).map(|i| axis.turn(f64::from(i) / f64::from(TURNS))).collect();
@@ -119,15 +119,15 @@ pub fn find_axis(
 
     let pictures = Targets::new(views, Some(PICTURE))?;
     let put = |cloud: &Gaussians, axis: Axis, reach| {
-        place(axis, reach, |axis| difference(cloud, &outlines, Some(axis), false))
+        place(axis, reach, |axis| difference(cloud, &silhouettes, Some(axis), false))
     };
     let before = difference::<Axis>(own, &pictures, None, false)?;
     (_, axis) = put(own, axis, [0.04, 0.004])?;
-    let both = Evidence { views, outlines: turned(views, &axis) };
+    let both = Evidence { views, silhouettes: turned(views, &axis) };
     let Some(mut cloud) = search.fitted(None, both, config)? else { return Ok(None) };
     for _ in 0..ROUNDS {
         (_, axis) = put(&cloud, axis, [0.01, 0.002])?;
-        let both = Evidence { views, outlines: turned(views, &axis) };
+        let both = Evidence { views, silhouettes: turned(views, &axis) };
         let Some(next) = search.fitted(Some(&cloud), both, &going_on(config))? else { return Ok(None) };
         cloud = next;
     }
@@ -135,10 +135,10 @@ pub fn find_axis(
     Ok((contradiction <= most).then_some(FoundAxis { axis, contradiction }))
 }
 
-/// The outlines of the views, turned all around the axis.
-pub fn turned<'a>(views: &'a [View], axis: &Axis) -> Vec<Outline<'a>> {
+/// The silhouettes of the views, turned all around the axis.
+pub fn turned<'a>(views: &'a [View], axis: &Axis) -> Vec<Silhouette<'a>> {
     let axis = *axis;
-    let turned = move |view: &'a View, i: u32| Outline {
+    let turned = move |view: &'a View, i: u32| Silhouette {
         camera: axis.camera(&view.camera, f64::from(i) / f64::from(TURNS)),
         ..view.into()
     };
@@ -207,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn what_keeps_its_outlines_is_told_from_what_does_not() {
+    fn what_keeps_its_silhouettes_is_told_from_what_does_not() {
         let find = |views: &[View], most| {
             find_axis(views, &own(views, &QUICK), &QUICK, most, 0, |_| ControlFlow::Continue(())).unwrap()
         };

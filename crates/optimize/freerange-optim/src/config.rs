@@ -29,7 +29,7 @@ pub struct FitConfig {
     pub iterations: usize,
     /// Number of Gaussians never exceeded, and reached if there are enough growth steps.
     pub cap_max: usize,
-    /// Number of Gaussians to start with, where no cloud is given; at most `cap_max`.
+    /// Number of Gaussians to start with, where none are given; at most `cap_max`.
     pub initial: usize,
     /// Their opacity at the start, 0..1. Fits that start from points on a surface take it, too.
     pub initial_opacity: f64,
@@ -100,12 +100,12 @@ impl Default for FitConfig {
     }
 }
 
-/// Settings of [`refine`](crate::refine). The defaults suit objects in the canonical frame (a sphere of radius 0.5 about
+/// Settings of [`optimize`](crate::optimize). The defaults suit objects in the canonical frame (a sphere of radius 0.5 about
 /// the origin).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct RefineConfig {
-    /// Optimization steps; each one looks at one view, and at one picture of the hold.
+pub struct OptimizationConfig {
+    /// Optimization steps; each one looks at one view, and at one anchor render.
     pub steps: usize,
     /// Number of Gaussians at the end; a cloud that has more keeps its number.
     pub gaussians: usize,
@@ -126,12 +126,12 @@ pub struct RefineConfig {
     /// Longest side in pixels at which these steps compare views. Smaller views are compared as they are.
     pub coarse_size: u32,
     /// What keeps the cloud where no view looks.
-    pub hold: HoldConfig,
+    pub anchors: AnchorConfig,
     /// Seed of everything drawn.
     pub seed: u64,
 }
 
-impl Default for RefineConfig {
+impl Default for OptimizationConfig {
     fn default() -> Self {
         Self {
             steps: 500,
@@ -144,18 +144,18 @@ impl Default for RefineConfig {
             render_size: Some(256),
             coarse: 0.0,
             coarse_size: 256,
-            hold: HoldConfig::default(),
+            anchors: AnchorConfig::default(),
             seed: 0,
         }
     }
 }
 
-/// Pictures of the cloud before a refinement, taken from all around it: further views that the refined one has to agree
+/// Pictures of the cloud before an optimization, taken from all around it: further views that the optimized one has to agree
 /// with.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct HoldConfig {
-    /// Weight of the mean absolute difference from a picture, beside a loss of weight 1 on a view. 0: no hold.
+pub struct AnchorConfig {
+    /// Weight of the mean absolute difference from a picture, beside a loss of weight 1 on a view. 0: no anchors.
     pub weight: f64,
     /// Number of pictures.
     pub views: usize,
@@ -165,7 +165,7 @@ pub struct HoldConfig {
     pub radius: f64,
 }
 
-impl Default for HoldConfig {
+impl Default for AnchorConfig {
     fn default() -> Self {
         Self { weight: 0.1, views: 12, size: 128, radius: 0.5 }
     }
@@ -241,22 +241,22 @@ impl FitConfig {
     }
 }
 
-/// Part of the steps of a refinement after which there are no more rounds of growth: the last Gaussians have to settle.
+/// Part of the steps of an optimization after which there are no more rounds of growth: the last Gaussians have to settle.
 const GROWTH_STOP: f64 = 5.0 / 6.0;
 
-/// Photos that the defaults of a refinement are for, and those from which on more change nothing.
+/// Photos that the defaults of an optimization are for, and those from which on more change nothing.
 const PHOTOS: usize = 4;
 const MOST_PHOTOS: usize = 16;
 
 /// Up to so many pixels, the longest side, pictures grow with the number of photos.
 const MOST_GROWN: u32 = 512;
 
-/// What [`RefineConfig::coarse`] is where detail is asked for: a third less time, and the same in the end.
+/// What [`OptimizationConfig::coarse`] is where detail is asked for: a third less time, and the same in the end.
 const COARSE: f64 = 0.6;
 
-impl RefineConfig {
-    /// These settings, which are for up to four photos, for so many: as many steps for each, more of their pixels, up to 512, and less of a
-    /// hold, since more of the object is seen. From sixteen photos on nothing changes any more.
+impl OptimizationConfig {
+    /// These settings, which are for up to four photos, for so many: as many steps for each, more of their pixels, up to 512, and less weight of
+    /// anchors, since more of the object is seen. From sixteen photos on nothing changes any more.
     #[must_use]
     pub fn for_photos(self, photos: usize) -> Self {
         let photos = photos.clamp(PHOTOS, MOST_PHOTOS);
@@ -265,12 +265,12 @@ impl RefineConfig {
         Self {
             steps: self.steps * photos / PHOTOS,
             render_size: self.render_size.map(grown),
-            hold: HoldConfig { weight: self.hold.weight / more.powf(1.5), ..self.hold },
+            anchors: AnchorConfig { weight: self.anchors.weight / more.powf(1.5), ..self.anchors },
             ..self
         }
     }
 
-    /// These settings for finer detail: so many times the size of pictures and the Gaussians, and so much less of a hold, whose own pictures
+    /// These settings for finer detail: so many times the size of pictures and the Gaussians, and so much less weight of the anchors, whose own pictures
     /// are small; at first at half that size. From 3 on half as many times the steps as well: 2 needs no more of them. 1 changes nothing.
     /// Photos, whose longest side has `longest` pixels, have no finer detail than their pixels: it is as much as they can show at most.
     #[must_use]
@@ -287,12 +287,12 @@ impl RefineConfig {
             render_size: self.render_size.map(grown),
             coarse: COARSE,
             coarse_size: (grown(self.coarse_size) / 2).max(1),
-            hold: HoldConfig { weight: self.hold.weight / detail as f64, ..self.hold },
+            anchors: AnchorConfig { weight: self.anchors.weight / detail as f64, ..self.anchors },
             ..self
         }
     }
 
-    /// Refuses values that no refinement can work with.
+    /// Refuses values that no optimization can work with.
     pub fn check(&self) -> Result<(), FitError> {
         let steps = self.steps;
         at_least_one("steps", steps)?;
@@ -304,7 +304,7 @@ impl RefineConfig {
         check_render_size(self.render_size)?;
         fraction("coarse", self.coarse)?;
         check("coarse_size", "at least 1 pixel", self.coarse_size, self.coarse_size > 0)?;
-        self.hold.check()
+        self.anchors.check()
     }
 
     /// The fit that goes on from a cloud of `start` Gaussians.
@@ -334,12 +334,12 @@ impl RefineConfig {
     }
 }
 
-impl HoldConfig {
+impl AnchorConfig {
     fn check(&self) -> Result<(), FitError> {
-        finite_not_negative("hold.weight", self.weight)?;
-        check("hold.views", "1 to 1000", self.views, (1..=1000).contains(&self.views))?;
-        check("hold.size", "16 to 1024", self.size, (16..=1024).contains(&self.size))?;
-        positive("hold.radius", self.radius)
+        finite_not_negative("anchors.weight", self.weight)?;
+        check("anchors.views", "1 to 1000", self.views, (1..=1000).contains(&self.views))?;
+        check("anchors.size", "16 to 1024", self.size, (16..=1024).contains(&self.size))?;
+        positive("anchors.radius", self.radius)
     }
 }
 
@@ -348,60 +348,60 @@ mod tests {
     use super::*;
 
     #[test]
-    fn more_photos_are_refined_longer_and_larger_and_held_less() {
-        let config = RefineConfig::default();
+    fn more_photos_are_optimized_longer_and_larger_and_held_less() {
+        let config = OptimizationConfig::default();
         for photos in [0, 2, 4] {
             assert_eq!(config.clone().for_photos(photos), config);
         }
         let eight = config.clone().for_photos(8);
         assert_eq!((eight.steps, eight.render_size), (1000, Some(362)));
-        assert!((eight.hold.weight - 0.1 / 8f64.sqrt()).abs() < 1e-12);
+        assert!((eight.anchors.weight - 0.1 / 8f64.sqrt()).abs() < 1e-12);
         let sixteen = config.clone().for_photos(16);
-        assert_eq!((sixteen.steps, sixteen.render_size, sixteen.hold.weight), (2000, Some(512), 0.1 / 8.0));
+        assert_eq!((sixteen.steps, sixteen.render_size, sixteen.anchors.weight), (2000, Some(512), 0.1 / 8.0));
         assert_eq!(config.clone().for_photos(usize::MAX), sixteen);
         sixteen.check().unwrap();
         // What is as large already stays.
         let detailed = config.clone().detailed(2, 4000).for_photos(8);
         assert_eq!((detailed.steps, detailed.render_size, detailed.gaussians), (1000, Some(512), 16_384));
         assert_eq!(config.clone().detailed(4, 4000).for_photos(16).render_size, Some(1024));
-        let whole = RefineConfig { render_size: None, ..config };
+        let whole = OptimizationConfig { render_size: None, ..config };
         assert_eq!(whole.for_photos(8).render_size, None);
     }
 
     #[test]
     fn detail_is_size_and_gaussians_and_later_steps() {
-        let config = RefineConfig::default();
+        let config = OptimizationConfig::default();
         for detail in [0, 1] {
             assert_eq!(config.clone().detailed(detail, 4000), config);
         }
         let two = config.clone().detailed(2, 512);
-        assert_eq!((two.steps, two.gaussians, two.render_size, two.hold.weight), (500, 16_384, Some(512), 0.05));
+        assert_eq!((two.steps, two.gaussians, two.render_size, two.anchors.weight), (500, 16_384, Some(512), 0.05));
         assert_eq!((two.coarse, two.coarse_size), (0.6, 256));
         let four = config.clone().detailed(4, 4000);
         assert_eq!((four.steps, four.gaussians, four.render_size, four.coarse_size), (1000, 32_768, Some(1024), 512));
-        assert_eq!(four.hold.weight, 0.025);
+        assert_eq!(four.anchors.weight, 0.025);
         four.check().unwrap();
         // No more than photos show.
         assert_eq!(config.clone().detailed(4, 512), two);
         assert_eq!(config.clone().detailed(4, 257), two);
         assert_eq!(config.clone().detailed(4, 256), config);
-        let whole = RefineConfig { render_size: None, ..config };
+        let whole = OptimizationConfig { render_size: None, ..config };
         assert_eq!(whole.detailed(4, 100).render_size, None);
     }
 
     #[test]
     fn defaults_pass_and_survive_serde() {
         FitConfig::default().check().unwrap();
-        RefineConfig::default().check().unwrap();
+        OptimizationConfig::default().check().unwrap();
         let text = serde_json::to_string(&FitConfig::default()).unwrap();
         assert_eq!(serde_json::from_str::<FitConfig>(&text).unwrap(), FitConfig::default());
-        assert_eq!(serde_json::from_str::<RefineConfig>("{}").unwrap(), RefineConfig::default());
+        assert_eq!(serde_json::from_str::<OptimizationConfig>("{}").unwrap(), OptimizationConfig::default());
     }
 
     #[test]
     fn unknown_fields_are_refused() {
         assert!(serde_json::from_str::<FitConfig>("{\"iteration\": 3}").is_err());
-        assert!(serde_json::from_str::<RefineConfig>("{\"step\": 3}").is_err());
+        assert!(serde_json::from_str::<OptimizationConfig>("{\"step\": 3}").is_err());
     }
 
     #[test]
@@ -420,8 +420,8 @@ mod tests {
         refused(&|c| c.lambda_ssim = 1.1, "lambda_ssim");
         refused(&|c| c.rates.color = f64::INFINITY, "rates.color");
         refused(&|c| c.render_size = Some(0), "render_size");
-        let refused = |change: &dyn Fn(&mut RefineConfig), field: &str| {
-            let mut config = RefineConfig::default();
+        let refused = |change: &dyn Fn(&mut OptimizationConfig), field: &str| {
+            let mut config = OptimizationConfig::default();
             change(&mut config);
             let message = config.check().unwrap_err().to_string();
             assert!(message.starts_with(field), "{message}");
@@ -432,19 +432,19 @@ mod tests {
         refused(&|c| c.final_mean_rate = f64::NAN, "final_mean_rate");
         refused(&|c| c.coarse = 1.5, "coarse");
         refused(&|c| c.coarse_size = 0, "coarse_size");
-        refused(&|c| c.hold.weight = -1.0, "hold.weight");
-        refused(&|c| c.hold.views = 0, "hold.views");
-        refused(&|c| c.hold.size = 8, "hold.size");
-        refused(&|c| c.hold.radius = f64::INFINITY, "hold.radius");
+        refused(&|c| c.anchors.weight = -1.0, "anchors.weight");
+        refused(&|c| c.anchors.views = 0, "anchors.views");
+        refused(&|c| c.anchors.size = 8, "anchors.size");
+        refused(&|c| c.anchors.radius = f64::INFINITY, "anchors.radius");
     }
 
     /// However few the steps and large the start, the fit is possible and its growth reaches the number asked for.
     #[test]
-    fn a_refinement_grows_to_its_number() {
+    fn an_optimization_grows_to_its_number() {
         for (steps, start, growth_rounds) in
             [(500, 1024, 16), (1, 1024, 16), (20, 1, 16), (1000, 5000, 16), (300, 9, 0), (7, 3, 1)]
         {
-            let config = RefineConfig { steps, growth_rounds, ..Default::default() };
+            let config = OptimizationConfig { steps, growth_rounds, ..Default::default() };
             let fit = config.fit(start);
             fit.check().unwrap();
             let due = |step: &usize| {

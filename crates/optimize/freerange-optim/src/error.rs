@@ -9,8 +9,8 @@ pub enum FitError {
     /// There is nothing to fit to.
     #[error("no views: a fit needs at least one")]
     NoViews,
-    /// There is nothing to refine.
-    #[error("the cloud to start from holds no Gaussians")]
+    /// There is nothing to optimize.
+    #[error("there are no Gaussians to start from")]
     NoGaussians,
     /// A view cannot be used.
     #[error("view {name:?}: {field}: expected {expected}, found {found}")]

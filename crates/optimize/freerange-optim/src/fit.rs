@@ -14,7 +14,7 @@ use rand::{SeedableRng, seq::SliceRandom};
 use rand_chacha::ChaCha8Rng;
 use std::ops::ControlFlow;
 
-/// Fits Gaussians to posed views, and outlines where there are any, by 3DGS-MCMC (Kheradmand et al. 2024): Adam on the photometric loss, with noise that
+/// Fits Gaussians to posed views, and silhouettes where there are any, by 3DGS-MCMC (Kheradmand et al. 2024): Adam on the photometric loss, with noise that
 /// lets faint Gaussians explore and relocation of dead ones, which also grows their number.
 ///
 /// Starts from `initial`, or, without it, from random Gaussians where all views see the object. `progress` hears of
@@ -36,11 +36,11 @@ pub fn fit<'a>(
         Some(cloud) => checked(cloud, config.cap_max)?,
         None => random_cloud(&targets, config, &mut rng),
     };
-    optimize(cloud, |_| &targets, config, &mut rng, |_, _| Ok(Vec::new()), progress)
+    descend(cloud, |_| &targets, config, &mut rng, |_, _| Ok(Vec::new()), progress)
 }
 
 /// The optimization itself. `of_step` is what each step compares with, at whatever size; `more` are further terms of the objective of a cloud over a background.
-pub(crate) fn optimize<'t>(
+pub(crate) fn descend<'t>(
     mut cloud: Gaussians,
     of_step: impl Fn(usize) -> &'t Targets,
     config: &FitConfig,
@@ -49,24 +49,24 @@ pub(crate) fn optimize<'t>(
     mut progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Gaussians, FitError> {
     let mut adam = Adam::default();
-    let (mut queue, mut outline_queue) = (Vec::new(), Vec::new());
+    let (mut queue, mut silhouette_queue) = (Vec::new(), Vec::new());
     for step in 0..config.iterations {
         let targets = of_step(step);
-        let outlines = targets.cameras.len() - targets.views;
+        let silhouettes = targets.cameras.len() - targets.views;
         let done = step as f64 / config.iterations as f64;
         let mean_rate = config.rates.mean * (config.final_mean_rate / config.rates.mean).powf(done);
 
         // Within the pool: from outside, each of the many small pieces of a step would wait for a thread to wake.
         let loss = rayon::scope(|_| {
-            // Every other step looks at outlines alone, if there are any.
-            let outlined = outlines > 0 && step % 2 == 1;
-            let chosen = match outlined {
-                true => next_views(&mut outline_queue, outlines, config.views_per_step, rng),
+            // Every other step looks at silhouettes alone, if there are any.
+            let by_silhouette = silhouettes > 0 && step % 2 == 1;
+            let chosen = match by_silhouette {
+                true => next_views(&mut silhouette_queue, silhouettes, config.views_per_step, rng),
                 false => next_views(&mut queue, targets.views, config.views_per_step, rng),
             };
             let background = config.background.draw(rng);
-            let own = || match outlined {
-                true => Objective::outlines(&cloud, targets, &chosen),
+            let own = || match by_silhouette {
+                true => Objective::silhouettes(&cloud, targets, &chosen),
                 false => Objective::photometric(&cloud, targets, &chosen, background, config.lambda_ssim),
             };
             let (own, further) = rayon::join(own, || more(&cloud, background));

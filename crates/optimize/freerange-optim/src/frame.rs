@@ -12,7 +12,7 @@ const SIZE: u32 = 128;
 /// Part of all that is seen that may lie beyond each face of the box. Of 0.25 to 2 %, the best for centers on generated
 /// objects: less believes strays, more cuts handles off.
 const BEYOND: f64 = 0.005;
-/// The object's radius by that of its outlines: few views seldom have its farthest point on one. Of 1, 1.01 and 1.02
+/// The object's radius by that of its silhouettes: few views seldom have its farthest point on one. Of 1, 1.01 and 1.02
 /// the best on generated objects.
 const HIDDEN: f64 = 1.01;
 /// Corrections beyond this factor on lengths mean that something else is wrong.
@@ -23,7 +23,7 @@ const MOST: f64 = 2.0;
 ///
 /// The center is that of the box around what the views see of the cloud, each Gaussian counting by its blending
 /// weights: where nothing is seen, a fit leaves Gaussians anywhere in the visual hull. The size is that of the masks'
-/// outlines about this center: that of a box of Gaussians depends on how much of them is cut off. The identity where
+/// silhouettes about this center: that of a box of Gaussians depends on how much of them is cut off. The identity where
 /// there are fewer than two masks, or the cloud is empty, not finite, not seen, or nowhere near.
 ///
 /// # Errors
@@ -37,8 +37,8 @@ pub fn frame_of(cloud: &Gaussians, views: &[View]) -> Result<Similarity, FitErro
     let correction = box_center(cloud, &seen).and_then(|center| {
         // The rough frame's sphere holds the object: no other needs to exceed it by more than the way between them. A
         // speck in one mask may say so.
-        let outlined = outline_radius(views, center)?.min(CANONICAL_RADIUS + center.length());
-        let scale = CANONICAL_RADIUS / (HIDDEN * outlined);
+        let by_silhouette = outline_radius(views, center)?.min(CANONICAL_RADIUS + center.length());
+        let scale = CANONICAL_RADIUS / (HIDDEN * by_silhouette);
         let near = center.length() < CANONICAL_RADIUS && (1.0 / MOST..=MOST).contains(&scale);
         near.then_some(Similarity { scale, rotation: DQuat::IDENTITY, translation: -scale * center })
     });

@@ -101,10 +101,10 @@ pub fn mirror_steps(config: &InitialFitConfig) -> usize {
 }
 
 /// The plane about which an object is its own mirror image, as far as photos of it tell: none where they doubt every plane by more than `most`
-/// (see [`FoundMirror::doubt`]), no plane suits their outlines, or they are all from one side. Of several the one that they doubt least.
+/// (see [`FoundMirror::doubt`]), no plane suits their silhouettes, or they are all from one side. Of several the one that they doubt least.
 /// `views` lie in the canonical frame; `own` is a [`initial_fit`](crate::initial_fit) of them.
 ///
-/// Three questions, each asked of fewer planes than the one before. Can what lies within all outlines and within all mirrored ones fill the outlines?
+/// Three questions, each asked of fewer planes than the one before. Can what lies within all silhouettes and within all mirrored ones fill the silhouettes?
 /// (All directions, fifteen degrees apart, but for those from which mirrored photos share nothing with the photos.) From behind which of these planes does that fit of the photos look most like them? And how much do photos
 /// and mirrored photos contradict each other, in a fit of both that moves the plane as well?
 /// `progress` hears how many of [`mirror_steps`] are done, of some more than once, and ends the search, with none, by `ControlFlow::Break`.
@@ -120,8 +120,8 @@ pub fn find_mirror(
     mut progress: impl FnMut(usize) -> ControlFlow<()>,
 ) -> Result<Option<FoundMirror>, FitError> {
     config.check()?;
-    let outlines = Targets::new(views, Some(OUTLINE))?;
-    let planes = planes(&Hull::new(&outlines), &outlines);
+    let silhouettes = Targets::new(views, Some(OUTLINE))?;
+    let planes = planes(&Hull::new(&silhouettes), &silhouettes);
     let pictures = Targets::new(views, Some(PICTURE))?;
     let mut search = Search { progress: &mut progress, seed, done: 0 };
     let put = |cloud: &Gaussians, plane: Mirror, reach| {
@@ -186,7 +186,7 @@ pub fn mirrored(views: &[View], mirror: &Mirror) -> Vec<View> {
     views.iter().map(|view| mirror.view(view)).collect()
 }
 
-/// Planes whose mirrored outlines leave enough of the hull to fill the outlines.
+/// Planes whose mirrored silhouettes leave enough of the hull to fill the silhouettes.
 fn planes(hull: &Hull, targets: &Targets) -> Vec<Mirror> {
     if hull.points.is_empty() || one_sided(targets) {
         return Vec::new();

@@ -47,8 +47,8 @@ impl Objective {
         Ok(Self { loss, gradients })
     }
 
-    /// Mean over the `chosen` outlines, counted from the first of them, of the absolute difference of alpha.
-    pub fn outlines(cloud: &Gaussians, targets: &Targets, chosen: &[usize]) -> Result<Self, FitError> {
+    /// Mean over the `chosen` silhouettes, counted from the first of them, of the absolute difference of alpha.
+    pub fn silhouettes(cloud: &Gaussians, targets: &Targets, chosen: &[usize]) -> Result<Self, FitError> {
         let mut sum = Self { loss: 0.0, gradients: vec![0.0; cloud.rows().len()] };
         let chosen: Vec<usize> = chosen.iter().map(|&i| targets.views + i).collect();
         for (group, raster) in targets.groups(&chosen) {
@@ -206,8 +206,8 @@ pub(crate) fn normalize_rotations(cloud: &mut Gaussians) {
 mod tests {
     use super::*;
     use crate::{
-        Evidence, HoldConfig, Outline,
-        hold::Hold,
+        AnchorConfig, Evidence, Silhouette,
+        anchors::Anchors,
         tests::{ball, ring},
     };
 
@@ -256,37 +256,38 @@ mod tests {
         views[2] = ring(3, 40, &ball(12, 1)).remove(2);
         let targets = Targets::new(&views, Some(32)).unwrap();
         assert_eq!(targets.groups(&[0, 1, 2]).map(|(group, _)| group.len()).collect::<Vec<_>>(), [2, 1]);
-        let hold = HoldConfig { weight: 0.5, views: 5, size: 24, ..Default::default() };
-        let hold = Hold::new(&[ball(12, 2)], &hold).unwrap();
+        let anchors = AnchorConfig { weight: 0.5, views: 5, size: 24, ..Default::default() };
+        let anchors = Anchors::new(&[ball(12, 2)], &anchors).unwrap();
         let value = |cloud: &Gaussians| {
             let mut o = Objective::photometric(cloud, &targets, &[0, 2], [0.3, 0.6, 0.1], 0.2).unwrap();
             o.add_opacity(cloud, 0.3);
             o.add_scale(cloud, 0.7);
-            o.add(&hold.objective(cloud, 1, [0.3, 0.6, 0.1]).unwrap());
+            o.add(&anchors.objective(cloud, 1, [0.3, 0.6, 0.1]).unwrap());
             o
         };
         check_gradient(value);
     }
 
     #[test]
-    fn gradients_of_outlines_match_finite_differences() {
+    fn gradients_of_silhouettes_match_finite_differences() {
         let mut views = ring(4, 24, &ball(12, 1));
         views[3] = ring(4, 40, &ball(12, 1)).remove(3);
         let targets = Targets::new(
-            Evidence { views: &views[..1], outlines: views[1..].iter().map(Outline::from).collect() },
+            Evidence { views: &views[..1], silhouettes: views[1..].iter().map(Silhouette::from).collect() },
             Some(32),
         )
         .unwrap();
-        let outlines = |cloud: &Gaussians, chosen: &[usize]| Objective::outlines(cloud, &targets, chosen).unwrap();
-        check_gradient(|cloud| outlines(cloud, &[0, 2]));
+        let silhouettes =
+            |cloud: &Gaussians, chosen: &[usize]| Objective::silhouettes(cloud, &targets, chosen).unwrap();
+        check_gradient(|cloud| silhouettes(cloud, &[0, 2]));
         // Colors are no part of them.
         let mut gray = ball(12, 3);
-        let colored = outlines(&gray, &[1]);
+        let colored = silhouettes(&gray, &[1]);
         gray.iter_mut().for_each(|row| row[channel::COLOR].fill(0.5));
-        let found = outlines(&gray, &[1]);
+        let found = silhouettes(&gray, &[1]);
         assert_eq!((found.loss, found.gradients), (colored.loss, colored.gradients));
         // What agrees has nothing to learn but what rounding to bytes leaves.
-        let own = outlines(&ball(12, 1), &[0, 1]);
+        let own = silhouettes(&ball(12, 1), &[0, 1]);
         assert!(own.loss < 2e-3 && colored.loss > 10.0 * own.loss, "{} {}", own.loss, colored.loss);
     }
 

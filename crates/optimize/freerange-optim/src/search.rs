@@ -1,4 +1,4 @@
-//! What searches for symmetries of an object have in common: the hull of its outlines, fits that are told of, and how unlike views are what a
+//! What searches for symmetries of an object have in common: the hull of its silhouettes, fits that are told of, and how unlike views are what a
 //! symmetry makes of them.
 
 use std::{f64::consts::PI, ops::ControlFlow};
@@ -11,7 +11,7 @@ use rayon::prelude::*;
 
 use crate::{Evidence, FitError, FitProgress, InitialFitConfig, initial::continue_fit, initial_fit, views::Targets};
 
-/// Longest side, in pixels, of the outlines that symmetries are judged by.
+/// Longest side, in pixels, of the silhouettes that symmetries are judged by.
 pub(crate) const OUTLINE: u32 = 64;
 /// Longest side, in pixels, of the pictures that they are judged by.
 pub(crate) const PICTURE: u32 = 128;
@@ -19,7 +19,7 @@ pub(crate) const PICTURE: u32 = 128;
 const CELLS: usize = 44;
 /// Half the side of that cube: a little more than the radius of an object in the canonical frame.
 const HALF: f64 = 0.52;
-/// Part of the outlines that what a symmetry leaves of the hull may not fill.
+/// Part of the silhouettes that what a symmetry leaves of the hull may not fill.
 pub(crate) const UNCOVERED: f64 = 0.01;
 /// How often a symmetry is put in its place by its own fit, and the fit goes on.
 pub(crate) const ROUNDS: usize = 3;
@@ -149,22 +149,22 @@ pub(crate) fn difference<S: Symmetry>(
     Ok(sum / f64::from(count.max(1)))
 }
 
-/// What lies within the outlines of all views.
+/// What lies within the silhouettes of all views.
 pub(crate) struct Hull<'a> {
     targets: &'a Targets,
-    cells: Vec<bool>,         // [CELLS, CELLS, CELLS]
-    pub points: Vec<DVec3>,   // of the cells within
-    pixels: Vec<Vec<usize>>,  // which pixel of each view shows them
-    outlines: Vec<Vec<bool>>, // what each view shows of the object
+    cells: Vec<bool>,            // [CELLS, CELLS, CELLS]
+    pub points: Vec<DVec3>,      // of the cells within
+    pixels: Vec<Vec<usize>>,     // which pixel of each view shows them
+    silhouettes: Vec<Vec<bool>>, // what each view shows of the object
 }
 
 impl<'a> Hull<'a> {
     pub fn new(targets: &'a Targets) -> Self {
-        let outlines: Vec<Vec<bool>> =
+        let silhouettes: Vec<Vec<bool>> =
             targets.images.iter().map(|image| image.pixels().map(|p| p[3] >= 128).collect()).collect();
-        let grown: Vec<Vec<bool>> = (0..outlines.len()).map(|i| grown(&outlines[i], targets.size(i))).collect();
+        let grown: Vec<Vec<bool>> = (0..silhouettes.len()).map(|i| grown(&silhouettes[i], targets.size(i))).collect();
         let mut hull =
-            Self { targets, cells: vec![false; CELLS.pow(3)], points: Vec::new(), pixels: Vec::new(), outlines };
+            Self { targets, cells: vec![false; CELLS.pow(3)], points: Vec::new(), pixels: Vec::new(), silhouettes };
         let place = |i: usize| ((i as f64 + 0.5) / CELLS as f64 * 2.0 - 1.0) * HALF;
         for (index, cell) in hull.cells.iter_mut().enumerate() {
             let at = [index / (CELLS * CELLS), index / CELLS % CELLS, index % CELLS];
@@ -179,19 +179,19 @@ impl<'a> Hull<'a> {
         hull
     }
 
-    /// The part of the outlines that points of the hull do not fill whose `copies` all lie within the hull.
+    /// The part of the silhouettes that points of the hull do not fill whose `copies` all lie within the hull.
     pub fn uncovered(&self, copies: &[impl Fn(DVec3) -> DVec3]) -> f64 {
-        let mut covered: Vec<Vec<bool>> = self.outlines.iter().map(|o| vec![false; o.len()]).collect();
+        let mut covered: Vec<Vec<bool>> = self.silhouettes.iter().map(|o| vec![false; o.len()]).collect();
         for (i, &point) in self.points.iter().enumerate() {
             if copies.iter().all(|copy| self.within(copy(point))) {
                 covered.iter_mut().zip(&self.pixels).for_each(|(covered, pixels)| covered[pixels[i]] = true);
             }
         }
         let (mut all, mut lost) = (0, 0);
-        for (i, outline) in self.outlines.iter().enumerate() {
+        for (i, silhouette) in self.silhouettes.iter().enumerate() {
             let covered = grown(&covered[i], self.targets.size(i));
-            all += outline.iter().filter(|o| **o).count();
-            lost += outline.iter().zip(covered).filter(|(o, c)| **o && !c).count();
+            all += silhouette.iter().filter(|o| **o).count();
+            lost += silhouette.iter().zip(covered).filter(|(o, c)| **o && !c).count();
         }
         lost as f64 / all.max(1) as f64
     }

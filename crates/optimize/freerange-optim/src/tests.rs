@@ -57,17 +57,17 @@ pub(crate) fn photograph(cloud: &Gaussians, camera: &Camera) -> View {
     View { name: "view".into(), camera: *camera, image }
 }
 
-/// Many outlines may share one picture, which is shrunk once.
+/// Many silhouettes may share one picture, which is shrunk once.
 #[test]
-fn outlines_share_pictures() {
+fn silhouettes_share_pictures() {
     let mut views = ring(2, 24, &ball(12, 1));
     views[1] = ring(2, 40, &ball(12, 1)).remove(1);
     let from = cameras(3, 24, 1.0);
-    let outlines = from.iter().zip([1, 0, 1]).map(|(camera, of)| {
+    let silhouettes = from.iter().zip([1, 0, 1]).map(|(camera, of)| {
         let (width, height) = views[of].image.dimensions();
-        Outline { camera: camera.resized(width, height), ..Outline::from(&views[of]) }
+        Silhouette { camera: camera.resized(width, height), ..Silhouette::from(&views[of]) }
     });
-    let targets = Targets::new(Evidence { views: &views, outlines: outlines.collect() }, Some(32)).unwrap();
+    let targets = Targets::new(Evidence { views: &views, silhouettes: silhouettes.collect() }, Some(32)).unwrap();
     assert_eq!((targets.views, targets.cameras.len()), (2, 5));
     for (i, (of, size)) in [(0, 24), (1, 32), (1, 32), (0, 24), (1, 32)].into_iter().enumerate() {
         let expected = freerange_scene::camera::image_ops::resize_area(&views[of].image, size, size);
@@ -77,8 +77,8 @@ fn outlines_share_pictures() {
         let found = &targets.cameras[i];
         assert!(found.width == size && (found.fx - camera.resized(size, size).fx).abs() < 1e-9, "{i}: {found:?}");
     }
-    let wrong = Outline { camera: from[0], ..Outline::from(&views[1]) };
-    let refused = Targets::new(Evidence { views: &views[..1], outlines: vec![wrong] }, None).err().unwrap();
+    let wrong = Silhouette { camera: from[0], ..Silhouette::from(&views[1]) };
+    let refused = Targets::new(Evidence { views: &views[..1], silhouettes: vec![wrong] }, None).err().unwrap();
     assert!(matches!(refused, FitError::View { field: "image", .. }), "{refused}");
 }
 
@@ -146,12 +146,13 @@ fn the_same_seed_gives_the_same_bytes() {
     let run = |seed| fit(&views, None, &FitConfig { seed, ..config.clone() }, go).unwrap();
     assert_eq!(run(1), run(1));
     assert_ne!(run(1), run(2));
-    let refined = |seed| {
-        let config = RefineConfig { steps: 20, gaussians: 60, hold: small_hold(), seed, ..Default::default() };
-        refine(&ball(30, 5), &[], &views, &config, go).unwrap()
+    let optimized = |seed| {
+        let config =
+            OptimizationConfig { steps: 20, gaussians: 60, anchors: small_anchors(), seed, ..Default::default() };
+        optimize(&ball(30, 5), &[], &views, &config, go).unwrap()
     };
-    assert_eq!(refined(1), refined(1));
-    assert_ne!(refined(1), refined(2));
+    assert_eq!(optimized(1), optimized(1));
+    assert_ne!(optimized(1), optimized(2));
 }
 
 #[test]
@@ -187,20 +188,20 @@ fn continuing_keeps_the_number_and_comes_nearer() {
 }
 
 /// A cloud as a generator might give it: right on the whole, wrong in detail.
-fn evidence<'a>(views: &'a [View], outlines: &'a [View]) -> Evidence<'a> {
-    Evidence { views, outlines: outlines.iter().map(Outline::from).collect() }
+fn evidence<'a>(views: &'a [View], silhouettes: &'a [View]) -> Evidence<'a> {
+    Evidence { views, silhouettes: silhouettes.iter().map(Silhouette::from).collect() }
 }
 
-/// Outlines from further places mend the shape, and tell no colors.
+/// Silhouettes from further places mend the shape, and tell no colors.
 #[test]
-fn outlines_are_fitted_to() {
+fn silhouettes_are_fitted_to() {
     let scene = ball(40, 12);
     let photos: Vec<View> = cameras(3, 32, 0.2).iter().map(|c| photograph(&scene, c)).collect();
-    let outlines = ring(12, 32, &scene);
+    let silhouettes = ring(12, 32, &scene);
     let config = FitConfig { iterations: 300, cap_max: 100, ..small() };
-    let seen = |outlines| evidence(&photos, outlines);
+    let seen = |silhouettes| evidence(&photos, silhouettes);
     let alone = fit(&photos, None, &config, go).unwrap();
-    let helped = fit(seen(&outlines), None, &config, go).unwrap();
+    let helped = fit(seen(&silhouettes), None, &config, go).unwrap();
     let apart = |cloud: &Gaussians| {
         let views = cameras(5, 32, 1.0).into_iter().map(|c| (photograph(&scene, &c), photograph(cloud, &c)));
         let each = views.map(|(a, b)| {
@@ -210,15 +211,15 @@ fn outlines_are_fitted_to() {
         each.sum::<f64>()
     };
     assert!(apart(&helped) < 0.7 * apart(&alone), "{} {}", apart(&helped), apart(&alone));
-    let config_of_refinement = RefineConfig { steps: 200, gaussians: 100, ..RefineConfig::default() };
-    let [plain, outlined] =
-        [&[][..], &outlines].map(|outlines| refine(&alone, &[], seen(outlines), &config_of_refinement, go).unwrap());
-    assert!(apart(&outlined) < 0.8 * apart(&plain), "{} {}", apart(&outlined), apart(&plain));
-    let mut gray = outlines.clone();
+    let config_of_optimization = OptimizationConfig { steps: 200, gaussians: 100, ..OptimizationConfig::default() };
+    let [plain, by_silhouette] = [&[][..], &silhouettes]
+        .map(|silhouettes| optimize(&alone, &[], seen(silhouettes), &config_of_optimization, go).unwrap());
+    assert!(apart(&by_silhouette) < 0.8 * apart(&plain), "{} {}", apart(&by_silhouette), apart(&plain));
+    let mut gray = silhouettes.clone();
     gray.iter_mut().for_each(|view| view.image.pixels_mut().for_each(|p| p.0 = [9, 99, 199, p[3]]));
     let other = fit(seen(&gray), None, &config, go).unwrap();
     assert_eq!(other, helped);
-    assert!(matches!(fit(evidence(&[], &outlines), None, &config, go), Err(FitError::NoViews)));
+    assert!(matches!(fit(evidence(&[], &silhouettes), None, &config, go), Err(FitError::NoViews)));
 }
 
 fn disturbed(cloud: &Gaussians, seed: u64) -> Gaussians {
@@ -232,8 +233,8 @@ fn disturbed(cloud: &Gaussians, seed: u64) -> Gaussians {
     out
 }
 
-fn small_hold() -> HoldConfig {
-    HoldConfig { size: 48, ..Default::default() }
+fn small_anchors() -> AnchorConfig {
+    AnchorConfig { size: 48, ..Default::default() }
 }
 
 #[test]
@@ -242,63 +243,70 @@ fn refining_helps_seen_and_unseen_views() {
     let start = disturbed(&scene, 22);
     let views = ring(4, 64, &scene);
     let held_out: Vec<View> = cameras(6, 64, 0.5).iter().map(|c| photograph(&scene, c)).collect();
-    let config = RefineConfig { steps: 300, gaussians: 90, hold: small_hold(), ..Default::default() };
+    let config = OptimizationConfig { steps: 300, gaussians: 90, anchors: small_anchors(), ..Default::default() };
     let mut seen = vec![];
-    let refined = refine(&start, &[], &views, &config, |p| {
+    let optimized = optimize(&start, &[], &views, &config, |p| {
         seen.push((p.step, p.gaussians));
         ControlFlow::Continue(())
     })
     .unwrap();
-    assert_eq!((seen[0], seen[299], refined.len()), ((1, 60), (300, 90), 90));
-    assert!(refined.check_finite().is_ok());
+    assert_eq!((seen[0], seen[299], optimized.len()), ((1, 60), (300, 90), 90));
+    assert!(optimized.check_finite().is_ok());
     for views in [&views, &held_out] {
-        let (before, after) = (psnr(&start, views), psnr(&refined, views));
+        let (before, after) = (psnr(&start, views), psnr(&optimized, views));
         assert!(after > before + 2.0, "{before} dB, then {after} dB");
     }
     // With fewer Gaussians asked for than there are, their number stays.
-    let config = RefineConfig { steps: 3, gaussians: 10, ..config };
-    assert_eq!(refine(&start, &[], &views, &config, go).unwrap().len(), 60);
+    let config = OptimizationConfig { steps: 3, gaussians: 10, ..config };
+    assert_eq!(optimize(&start, &[], &views, &config, go).unwrap().len(), 60);
 }
 
-/// Coarse steps see what a refinement at their size sees, and the others all there is.
+/// Coarse steps see what an optimization at their size sees, and the others all there is.
 #[test]
 fn refining_may_begin_with_small_pictures() {
     let scene = ball(60, 21);
     let (start, views) = (disturbed(&scene, 22), ring(4, 64, &scene));
-    let refined = |coarse, coarse_size, render_size| {
-        let (render_size, hold) = (Some(render_size), small_hold());
-        let config =
-            RefineConfig { steps: 20, gaussians: 90, coarse, coarse_size, render_size, hold, ..Default::default() };
-        refine(&start, &[], &views, &config, go).unwrap()
+    let optimized = |coarse, coarse_size, render_size| {
+        let (render_size, anchors) = (Some(render_size), small_anchors());
+        let config = OptimizationConfig {
+            steps: 20,
+            gaussians: 90,
+            coarse,
+            coarse_size,
+            render_size,
+            anchors,
+            ..Default::default()
+        };
+        optimize(&start, &[], &views, &config, go).unwrap()
     };
-    let (small, whole) = (refined(0.0, 1, 32), refined(0.0, 1, 64));
-    assert_eq!(refined(1.0, 32, 64).rows(), small.rows());
+    let (small, whole) = (optimized(0.0, 1, 32), optimized(0.0, 1, 64));
+    assert_eq!(optimized(1.0, 32, 64).rows(), small.rows());
     // The views have 64 pixels.
-    assert_eq!(refined(1.0, 1000, 64).rows(), whole.rows());
-    let both = refined(0.5, 32, 64);
+    assert_eq!(optimized(1.0, 1000, 64).rows(), whole.rows());
+    let both = optimized(0.5, 32, 64);
     assert!(both.rows() != small.rows() && both.rows() != whole.rows());
 }
 
 /// Refined together, equal clouds look as one does, and there are no more Gaussians than were asked for.
 #[test]
-fn clouds_are_refined_together() {
+fn clouds_are_optimized_together() {
     let scene = ball(60, 21);
     let start = disturbed(&scene, 22);
     let (views, alone) = (ring(4, 64, &scene), ring(4, 64, &start));
     let begun = |others: &[Gaussians], gaussians| {
-        let hold = small_hold();
+        let anchors = small_anchors();
         // Too slow to move anything.
         let rates = Rates { mean: 1e-9, scale: 0.0, rotation: 0.0, opacity: 0.0, color: 0.0 };
-        let config = RefineConfig {
+        let config = OptimizationConfig {
             steps: 1,
             growth_rounds: 0,
             gaussians,
             rates,
             final_mean_rate: 1e-9,
-            hold,
+            anchors,
             ..Default::default()
         };
-        refine(&start, others, &views, &config, go).unwrap()
+        optimize(&start, others, &views, &config, go).unwrap()
     };
     let other = disturbed(&scene, 23);
     for (others, gaussians, expected) in [
@@ -319,7 +327,7 @@ fn clouds_are_refined_together() {
 
 /// All views from one side: that side gets better, and the other, which they say nothing of, stays what it was.
 #[test]
-fn a_hold_keeps_the_unseen_side() {
+fn anchors_keep_the_unseen_side() {
     let scene = ball(150, 31);
     let start = disturbed(&scene, 32);
     let from = |angle: f64, cloud: &Gaussians| {
@@ -330,11 +338,12 @@ fn a_hold_keeps_the_unseen_side() {
         turned.map(|c| photograph(cloud, &c))
     };
     let (photos, behind) = (from(0.0, &scene), from(std::f64::consts::PI, &start));
-    let refined = |weight| {
-        let hold = HoldConfig { weight, ..small_hold() };
-        refine(&start, &[], &photos, &RefineConfig { gaussians: 200, hold, ..Default::default() }, go).unwrap()
+    let optimized = |weight| {
+        let anchors = AnchorConfig { weight, ..small_anchors() };
+        optimize(&start, &[], &photos, &OptimizationConfig { gaussians: 200, anchors, ..Default::default() }, go)
+            .unwrap()
     };
-    let (held, free) = (refined(0.5), refined(0.0));
+    let (held, free) = (optimized(0.5), optimized(0.0));
     let gain = psnr(&held, &photos) - psnr(&start, &photos);
     assert!(gain > 4.0, "{gain} dB");
     let (held, free) = (psnr(&held, &behind), psnr(&free, &behind));
@@ -354,11 +363,18 @@ fn other_guesses_help_on_the_unseen_side() {
     };
     let (photos, behind) = (from(0.0), from(std::f64::consts::PI));
     let guesses: Vec<Gaussians> = (32..36).map(|seed| disturbed(&scene, seed)).collect();
-    let refined = |others: &[Gaussians]| {
-        let hold = HoldConfig { weight: 0.5, ..small_hold() };
-        refine(&guesses[0], others, &photos, &RefineConfig { gaussians: 200, hold, ..Default::default() }, go).unwrap()
+    let optimized = |others: &[Gaussians]| {
+        let anchors = AnchorConfig { weight: 0.5, ..small_anchors() };
+        optimize(
+            &guesses[0],
+            others,
+            &photos,
+            &OptimizationConfig { gaussians: 200, anchors, ..Default::default() },
+            go,
+        )
+        .unwrap()
     };
-    let (alone, together) = (psnr(&refined(&[]), &behind), psnr(&refined(&guesses[1..]), &behind));
+    let (alone, together) = (psnr(&optimized(&[]), &behind), psnr(&optimized(&guesses[1..]), &behind));
     assert!(together > alone + 1.0, "{alone} dB alone, {together} dB together");
 }
 
@@ -382,10 +398,10 @@ fn views_may_have_any_size() {
     let photos: Vec<View> = photos.iter().map(|c| photograph(&scene, c)).collect();
     let held_out: Vec<View> = cameras(6, 64, 0.5).iter().map(|c| photograph(&scene, c)).collect();
     let start = disturbed(&scene, 22);
-    let config = RefineConfig { steps: 300, gaussians: 90, hold: small_hold(), ..Default::default() };
-    let refined = refine(&start, &[], &photos, &config, go).unwrap();
+    let config = OptimizationConfig { steps: 300, gaussians: 90, anchors: small_anchors(), ..Default::default() };
+    let optimized = optimize(&start, &[], &photos, &config, go).unwrap();
     for views in [&photos, &held_out] {
-        let (before, after) = (psnr(&start, views), psnr(&refined, views));
+        let (before, after) = (psnr(&start, views), psnr(&optimized, views));
         assert!(after > before + 2.0, "{before} dB, then {after} dB");
     }
     let fitted = fit(&photos, None, &FitConfig { views_per_step: 3, render_size: Some(64), ..small() }, go).unwrap();
@@ -400,11 +416,11 @@ fn bad_input_is_refused() {
     let fit_message = |views: &[View], cloud: Option<&Gaussians>| {
         fit(views, cloud, &FitConfig { iterations: 1, ..Default::default() }, go).unwrap_err().to_string()
     };
-    let refine_message = |views: &[View], cloud: &Gaussians| {
-        refine(cloud, &[], views, &RefineConfig::default(), go).unwrap_err().to_string()
+    let optimize_message = |views: &[View], cloud: &Gaussians| {
+        optimize(cloud, &[], views, &OptimizationConfig::default(), go).unwrap_err().to_string()
     };
     let both = |views: &[View], expected: &str| {
-        for message in [fit_message(views, None), refine_message(views, &cloud)] {
+        for message in [fit_message(views, None), optimize_message(views, &cloud)] {
             assert!(message.contains(expected), "{message}");
         }
     };
@@ -424,7 +440,7 @@ fn bad_input_is_refused() {
     let mut broken = cloud.clone();
     broken.rows_mut()[20] = f32::NAN;
     for (bad, expected) in [(&broken, "NaN"), (&Gaussians::default(), "no Gaussians")] {
-        for message in [fit_message(&views, Some(bad)), refine_message(&views, bad)] {
+        for message in [fit_message(&views, Some(bad)), optimize_message(&views, bad)] {
             assert!(message.contains(expected), "{message}");
         }
     }

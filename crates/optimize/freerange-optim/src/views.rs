@@ -12,13 +12,13 @@ use rayon::prelude::*;
 pub struct Evidence<'a> {
     /// Posed views.
     pub views: &'a [View],
-    /// Outlines from further places.
-    pub outlines: Vec<Outline<'a>>,
+    /// Silhouettes from further places.
+    pub silhouettes: Vec<Silhouette<'a>>,
 }
 
 /// What a picture tells of an object's shape, and of that alone: its alpha. Many may share one picture.
 #[derive(Clone, Copy, Debug)]
-pub struct Outline<'a> {
+pub struct Silhouette<'a> {
     /// Of the view that it comes from, for messages.
     pub name: &'a str,
     /// From where it is seen.
@@ -27,7 +27,7 @@ pub struct Outline<'a> {
     pub image: &'a RgbaImage,
 }
 
-impl<'a> From<&'a View> for Outline<'a> {
+impl<'a> From<&'a View> for Silhouette<'a> {
     fn from(view: &'a View) -> Self {
         Self { name: &view.name, camera: view.camera, image: &view.image }
     }
@@ -35,7 +35,7 @@ impl<'a> From<&'a View> for Outline<'a> {
 
 impl<'a> From<&'a [View]> for Evidence<'a> {
     fn from(views: &'a [View]) -> Self {
-        Self { views, outlines: Vec::new() }
+        Self { views, silhouettes: Vec::new() }
     }
 }
 
@@ -51,20 +51,20 @@ impl<'a, const N: usize> From<&'a [View; N]> for Evidence<'a> {
     }
 }
 
-/// Views, each of its own size, and after them those of which the outline alone counts.
+/// Views, each of its own size, and after them those of which the silhouette alone counts.
 pub(crate) struct Targets {
     pub cameras: Vec<Camera>,
     pub images: Vec<RgbaImage>,
-    /// How many of them are more than outlines.
+    /// How many of them are more than silhouettes.
     pub views: usize,
     rasters: Vec<RasterConfig>,
 }
 
-fn refuse<T>(view: &Outline<'_>, field: &'static str, expected: String, found: String) -> Result<T, FitError> {
+fn refuse<T>(view: &Silhouette<'_>, field: &'static str, expected: String, found: String) -> Result<T, FitError> {
     Err(FitError::View { name: view.name.to_owned(), field, expected, found })
 }
 
-fn check(view: &Outline<'_>) -> Result<(), FitError> {
+fn check(view: &Silhouette<'_>) -> Result<(), FitError> {
     let c = &view.camera;
     let (width, height) = view.image.dimensions();
     if (width, height) != (c.width, c.height) {
@@ -96,7 +96,7 @@ impl Targets {
         if seen.views.is_empty() {
             return Err(FitError::NoViews);
         }
-        let all: Vec<Outline<'_>> = seen.views.iter().map(Outline::from).chain(seen.outlines).collect();
+        let all: Vec<Silhouette<'_>> = seen.views.iter().map(Silhouette::from).chain(seen.silhouettes).collect();
         all.iter().try_for_each(check)?;
         // Each picture once, however many share it.
         let mut pictures: Vec<&RgbaImage> = Vec::new();

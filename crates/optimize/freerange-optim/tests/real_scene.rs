@@ -1,8 +1,8 @@
-//! A rendered real object: fitted from 12 views and shown from 4 others, then spoilt and refined from those 4.
+//! A rendered real object: fitted from 12 views and shown from 4 others, then spoilt and optimized from those 4.
 //! `cargo test --release -p freerange-optim --test real_scene -- --ignored --nocapture` prints the figures.
 
 use freerange_gaussians::{Gaussians, channel};
-use freerange_optim::{FitConfig, RefineConfig, fit, refine};
+use freerange_optim::{FitConfig, OptimizationConfig, fit, optimize};
 use freerange_raster::{RasterConfig, render};
 use freerange_scene::camera::{Scene, View, image_ops};
 use rand::{Rng, SeedableRng};
@@ -31,7 +31,7 @@ fn psnr(cloud: &Gaussians, views: &[View]) -> f64 {
 
 #[test]
 #[ignore = "needs FREERANGE_SHARED"]
-fn a_real_object_is_fitted_and_refined() {
+fn a_real_object_is_fitted_and_optimized() {
     let (around, others) = (views("transforms_val.json", 128), views("transforms_full.json", 128));
     let config = FitConfig { iterations: 2000, cap_max: 2048, initial: 1024, ..Default::default() };
     let start = Instant::now();
@@ -52,12 +52,13 @@ fn a_real_object_is_fitted_and_refined() {
     }
     let before = psnr(&spoilt, &around);
     let start = Instant::now();
-    let refined = refine(&spoilt, &[], &others, &RefineConfig::default(), |_| ControlFlow::Continue(())).unwrap();
-    let (seen, unseen) = (psnr(&refined, &others), psnr(&refined, &around));
+    let optimized =
+        optimize(&spoilt, &[], &others, &OptimizationConfig::default(), |_| ControlFlow::Continue(())).unwrap();
+    let (seen, unseen) = (psnr(&optimized, &others), psnr(&optimized, &around));
     let seconds = start.elapsed().as_secs_f64();
     println!(
-        "refine: {before:.2} dB, then {unseen:.2} dB on 12 unseen views; {seen:.2} dB on the 4 seen; {seconds:.1} s"
+        "optimize: {before:.2} dB, then {unseen:.2} dB on 12 unseen views; {seen:.2} dB on the 4 seen; {seconds:.1} s"
     );
-    // The hold keeps some of what was spoilt: it cannot know.
+    // Anchors keep some of what was spoilt: it cannot know.
     assert!(unseen > before + 2.0 && seen > 40.0);
 }

@@ -127,7 +127,7 @@ impl Request {
         let get = |name: &str| headers.iter().find(|(k, _)| k == name).map(|(_, v)| v.as_str());
         // Two readings of one message are how requests are smuggled.
         if get("transfer-encoding").is_some() {
-            return Err(Refusal::new(501, "Transfer-Encoding is not taken: tell the Content-Length"));
+            return Err(Refusal::new(501, "Transfer-Encoding is not taken: send a Content-Length"));
         }
         if get("content-encoding").is_some_and(|v| !v.eq_ignore_ascii_case("identity")) {
             return Err(Refusal::new(415, "compressed requests are not taken"));

@@ -26,6 +26,7 @@ mod record;
 mod routes;
 mod scene;
 mod server;
+mod splats;
 mod upload;
 
 pub use config::{Example, Limits, ServeConfig};

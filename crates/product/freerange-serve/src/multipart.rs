@@ -41,7 +41,7 @@ pub fn boundary(kind: Option<&str>) -> Result<&str, Refusal> {
         k.trim().eq_ignore_ascii_case("boundary").then(|| v.trim().trim_matches('"'))
     });
     let fine = |v: &&str| !v.is_empty() && v.len() <= BOUNDARY && v.bytes().all(|b| b.is_ascii_graphic() || b == b' ');
-    value.filter(fine).ok_or_else(|| malformed("the Content-Type tells no boundary"))
+    value.filter(fine).ok_or_else(|| malformed("the Content-Type has no boundary"))
 }
 
 fn find(haystack: &[u8], needle: &[u8]) -> Option<usize> {

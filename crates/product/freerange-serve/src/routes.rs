@@ -270,7 +270,7 @@ fn post(site: &Site, request: &mut Request) -> Answer {
     }
     match (example, &site.example) {
         (None, _) if upload.title.is_none() => {
-            return Err(Refusal::new(422, "expected files of photos and cameras, found none"));
+            return Err(Refusal::new(422, "expected files of photos and cameras, or one of Gaussians, found none"));
         }
         (None, _) => {}
         (Some(_), _) if upload.title.is_some() => {
@@ -285,11 +285,15 @@ fn post(site: &Site, request: &mut Request) -> Answer {
         }
         (Some(_), _) => return Err(Refusal::new(404, "there is no such example")),
     }
+    let splats = upload.only_splats()?;
+    if splats.is_some() && options.is_some() {
+        return Err(Refusal::new(422, "field `go`: expected photos; a file of Gaussians is shown, not computed"));
+    }
     board.metrics.uploaded.fetch_add(upload.bytes, Relaxed);
     let title = upload.title.take().unwrap_or_default();
     let passed_over = std::mem::take(&mut upload.passed_over);
     let bytes = upload.bytes;
-    let id = arriving.submit(Submission { title, scene, go: options, passed_over, bytes })?;
+    let id = arriving.submit(Submission { title, scene, go: options, splats, passed_over, bytes })?;
     Ok(Response::json(&board.get(&id)?).status(201))
 }
 
@@ -338,9 +342,7 @@ impl StreamPlace {
         let most = (board.limits().connections as u64 * 2).div_ceil(3);
         match before < most {
             true => Ok(place),
-            false => {
-                Err(Refusal::new(503, format!("{most} streams of events are open, which is all there is room for")))
-            }
+            false => Err(Refusal::new(503, format!("{most} streams of events are open, which is the limit"))),
         }
     }
 }

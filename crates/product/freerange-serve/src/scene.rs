@@ -47,7 +47,7 @@ impl SceneOptions {
         })
     }
 
-    fn up(&self) -> Result<Option<Up>, Refusal> {
+    pub fn up(&self) -> Result<Option<Up>, Refusal> {
         Ok(match self.up.as_deref() {
             None | Some("auto") => None,
             Some("z") => Some(Up::Z),
@@ -168,7 +168,7 @@ impl Preparation<'_> {
             false => Err(Refusal::new(
                 507,
                 format!(
-                    "photos and masks: expected at most {most} MB on disk, which is all there is room for, found {found} MB; remove some jobs"
+                    "photos and masks: expected at most {most} MB on disk, which is the limit, found {found} MB; remove some jobs"
                 ),
             )),
         }

@@ -18,6 +18,7 @@ const NAME: usize = 120;
 const DEPTH: usize = 6;
 const PICTURES: [&str; 4] = ["png", "jpg", "jpeg", "webp"];
 const CAMERAS: [&str; 5] = ["json", "bin", "txt", "xml", "csv"];
+const SPLATS: [&str; 7] = ["ply", "splat", "spz", "sog", "glb", "usda", "usdz"];
 const ARCHIVES: [&str; 9] = ["zip", "gz", "tgz", "tar", "7z", "rar", "xz", "zst", "bz2"];
 /// Most bytes of a JSON file: its reader holds it whole.
 const JSON: u64 = 8 << 20;
@@ -27,6 +28,10 @@ pub struct Upload<'a> {
     folder: &'a Path,
     limits: &'a Limits,
     files: usize,
+    /// Photos and files of cameras.
+    of_scenes: usize,
+    /// Files of Gaussians, and the clients' names of them.
+    splats: Vec<(PathBuf, String)>,
     pixels: u64,
     /// Bytes that were written.
     pub bytes: u64,
@@ -40,6 +45,7 @@ pub struct Upload<'a> {
 enum Kind {
     Picture,
     Cameras,
+    Splats,
     Other,
 }
 
@@ -79,6 +85,7 @@ fn kind(parts: &[&str]) -> Result<Kind, Refusal> {
         () if parts.iter().any(|p| p.starts_with('.')) => Kind::Other,
         () if PICTURES.contains(&extension) => Kind::Picture,
         () if CAMERAS.contains(&extension) => Kind::Cameras,
+        () if SPLATS.contains(&extension) => Kind::Splats,
         () => Kind::Other,
     })
 }
@@ -86,7 +93,17 @@ fn kind(parts: &[&str]) -> Result<Kind, Refusal> {
 impl<'a> Upload<'a> {
     /// Files will go to `folder`, which is there and empty.
     pub fn new(folder: &'a Path, limits: &'a Limits) -> Self {
-        Self { folder, limits, files: 0, pixels: 0, bytes: 0, passed_over: Vec::new(), title: None }
+        Self {
+            folder,
+            limits,
+            files: 0,
+            of_scenes: 0,
+            splats: Vec::new(),
+            pixels: 0,
+            bytes: 0,
+            passed_over: Vec::new(),
+            title: None,
+        }
     }
 
     /// Takes the file that the client calls `name`; `read` gives its bytes, and none at the end.
@@ -103,9 +120,7 @@ impl<'a> Upload<'a> {
         let kind = kind(&parts)?;
         let mut chunk = vec![0; 64 << 10];
         if matches!(kind, Kind::Other) {
-            if self.passed_over.len() < 20 {
-                self.passed_over.push(shown(name));
-            }
+            self.pass_over(shown(name));
             while read(&mut chunk)? > 0 {}
             return Ok(());
         }
@@ -135,25 +150,53 @@ impl<'a> Upload<'a> {
         writer.flush().map_err(|e| written(&e))?;
         drop(writer);
         match kind {
+            Kind::Splats => self.splats.push((path.clone(), shown(name))),
+            _ => self.of_scenes += 1,
+        }
+        match kind {
             Kind::Picture => self.picture(&path, name),
             Kind::Cameras if is_json => json(&path, name),
             _ => Ok(()),
         }
     }
 
+    fn pass_over(&mut self, name: String) {
+        if self.passed_over.len() < 20 {
+            self.passed_over.push(name);
+        }
+    }
+
+    /// The file of Gaussians, where that is all there is. Beside photos and cameras such files are of no use, and go.
+    pub fn only_splats(&mut self) -> Result<Option<PathBuf>, Refusal> {
+        let mut splats = std::mem::take(&mut self.splats);
+        if self.of_scenes > 0 {
+            for (path, name) in splats {
+                fs::remove_file(path).map_err(Refusal::own)?;
+                self.pass_over(name);
+            }
+            return Ok(None);
+        }
+        if splats.len() > 1 {
+            let text =
+                format!("expected photos with cameras, or one file of Gaussians, found {} of these", splats.len());
+            return Err(Refusal::new(422, text));
+        }
+        Ok(splats.pop().map(|(path, _)| path))
+    }
+
     /// Looks at a picture's head: its kind and size have to be usual before anything is decoded.
     fn picture(&mut self, path: &Path, name: &str) -> Result<(), Refusal> {
         let (width, height) =
-            picture_size(path).map_err(|what| Refusal::new(422, format!("picture `{}`: {what}", shown(name))))?;
+            picture_size(path).map_err(|what| Refusal::new(422, format!("image `{}`: {what}", shown(name))))?;
         let pixels = u64::from(width) * u64::from(height);
         self.pixels += pixels;
         let (one, all) = (self.limits.pixels, self.limits.job_pixels);
         if pixels > one {
-            let text = format!("picture `{}`: expected at most {one} pixels, found {width} x {height}", shown(name));
+            let text = format!("image `{}`: expected at most {one} pixels, found {width} x {height}", shown(name));
             return Err(Refusal::new(413, text));
         }
         if self.pixels > all {
-            return Err(Refusal::new(413, format!("expected pictures of at most {all} pixels together")));
+            return Err(Refusal::new(413, format!("expected images of at most {all} pixels together")));
         }
         Ok(())
     }

@@ -13,7 +13,10 @@ use std::{
 };
 
 use common::*;
-use freerange_gaussians::formats::{Format, Frame, parse};
+use freerange_gaussians::{
+    Gaussians, Harmonics, Splats,
+    formats::{Format, Frame, WriteOptions, encode, parse},
+};
 use freerange_serve::{Limits, ServeConfig};
 use image::{Rgba, RgbaImage};
 
@@ -166,8 +169,11 @@ fn photos_are_looked_at_and_edited_before_they_are_computed() {
 fn one_computes_at_a_time_and_cancelling_works_at_once() {
     let engine = Fake::slow();
     let server = Running::plain(engine.clone());
-    let ids: Vec<String> = (0..3).map(|_| server.example("{}")).collect();
-    server.until(&ids[0], &["running"]);
+    // Two are read at the same time: the first to be read computes first.
+    let first = server.example("{}");
+    server.until(&first, &["running"]);
+    let mut ids = vec![first];
+    ids.extend((0..2).map(|_| server.example("{}")));
     ids[1..].iter().for_each(|id| drop(server.until(id, &["queued"])));
     assert_eq!(server.until(&ids[2], &["queued"])["position"], 1, "one waits before it");
     let cancel = |id: &str| server.send("POST", &format!("/jobs/{id}/cancel"), "", b"");
@@ -240,8 +246,9 @@ fn a_restart_finds_finished_jobs_and_says_of_others_that_they_did_not_survive() 
     let slow = Running::start(config(keep.path()), Fake::slow());
     assert_eq!(slow.json(&format!("/jobs/{done}"))["state"], "done");
     assert_eq!(slow.get(&format!("/jobs/{done}/samples/0.ply")).status, 200);
-    let (running, queued) = (slow.example("{}"), slow.example("{}"));
+    let running = slow.example("{}");
     slow.until(&running, &["running"]);
+    let queued = slow.example("{}");
     slow.until(&queued, &["queued"]);
     // As after kill -9: nothing was told to end.
     snapshot(keep.path(), copy.path());
@@ -284,4 +291,102 @@ fn without_a_folder_nothing_stays() {
     assert_eq!(mine(), 1);
     server.stop();
     assert_eq!(mine(), 0);
+}
+
+fn splats() -> Splats {
+    let cloud = Fake::cloud(1, 2);
+    let harmonics = Harmonics::from_rows(1, (0..9 * cloud.len()).map(|i| 0.01 * (i as f32).sin()).collect());
+    Splats { harmonics, ..Splats::from(cloud) }
+}
+
+fn file(format: Format, frame: Frame) -> Vec<u8> {
+    encode(&splats(), format, &WriteOptions { frame, ..WriteOptions::default() }).unwrap().bytes
+}
+
+/// Gaussians of a file are shown, cropped and converted as results are; nothing of them is lost.
+#[test]
+fn a_file_of_gaussians_is_a_result() {
+    let server = Running::plain(Fake::quick());
+    for (name, format, up) in [
+        ("mug.ply", Format::Ply, [0.0, -1.0, 0.0]),
+        ("Mug.SPZ", Format::Spz, [0.0, 0.0, 1.0]),
+        ("mug.glb", Format::Glb, [0.0, 0.0, 1.0]),
+        ("mug.usdz", Format::Usdz, [0.0, 0.0, 1.0]),
+    ] {
+        let frame = if format == Format::Ply { Frame::Y_DOWN } else { Frame::Z_UP };
+        let reply = server.post_form(&[Part::file(name, file(format, frame))]);
+        assert_eq!(reply.status, 201, "{name}: {}", reply.text());
+        let id = reply.json()["id"].as_str().unwrap().to_owned();
+        let job = server.until(&id, &["done", "failed"]);
+        assert_eq!(job["state"], "done", "{job}");
+        assert_eq!((&job["title"], &job["may_go"]), (&name.split('.').next().unwrap().into(), &false.into()), "{job}");
+        assert_eq!(job["samples"], serde_json::json!([{ "seed": 0, "gaussians": 40 }]));
+        let found: Vec<f64> = job["up"].as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect();
+        assert!(found.iter().zip(up).all(|(a, b)| (a - b).abs() < 1e-6), "{name}: {found:?}");
+        assert!(
+            job["understood"]["radius"].as_f64().unwrap() > 0.1 && job["understood"]["views"] == serde_json::json!([])
+        );
+        assert_eq!(server.get(&format!("/jobs/{id}/thumbnail.png")).status, 200);
+        let rows = server.get(&format!("/jobs/{id}/samples/0"));
+        assert_eq!(rows.body.len(), 40 * 56);
+        for to in Format::ALL {
+            let reply = server.get(&format!("/jobs/{id}/samples/0.{to}"));
+            assert_eq!(reply.status, 200, "{name} to {to}");
+            let again = parse(to, &reply.body, std::path::Path::new("x"), frame).unwrap();
+            assert_eq!(again.splats.cloud.len(), 40);
+        }
+        // Cropped, harmonics stay with their Gaussians.
+        let kept: Vec<u8> = (0..40).map(|i| u8::from(i % 2 == 0)).collect();
+        assert_eq!(server.send("PUT", &format!("/jobs/{id}/samples/0/kept"), "", &kept).json()["gaussians"], 20);
+        let reply = server.get(&format!("/jobs/{id}/samples/0.ply"));
+        let half = parse(Format::Ply, &reply.body, std::path::Path::new("x.ply"), frame).unwrap().splats;
+        assert_eq!(half.cloud.len(), 20);
+        if format == Format::Ply {
+            let expected = splats().select(&(0..40).step_by(2).collect::<Vec<_>>());
+            assert_eq!(half.harmonics.degree(), 1);
+            let apart = half.harmonics.rows().iter().zip(expected.harmonics.rows()).map(|(a, b)| (a - b).abs());
+            assert!(apart.fold(0.0, f32::max) < 1e-6);
+            let apart = half.cloud.rows().iter().zip(expected.cloud.rows()).map(|(a, b)| (a - b).abs());
+            assert!(apart.fold(0.0, f32::max) < 1e-6);
+        }
+        assert_eq!(server.send("POST", &format!("/jobs/{id}/go"), "", b"").status, 409);
+    }
+}
+
+#[test]
+fn files_of_gaussians_that_cannot_be_shown_are_refused() {
+    let limits = Limits { memory: 1 << 20, ..Limits::default() };
+    let server = Running::start(ServeConfig { limits, ..ServeConfig::default() }, Fake::quick());
+    let ply = file(Format::Ply, Frame::Z_UP);
+    let two =
+        server.post_form(&[Part::file("a.ply", ply.clone()), Part::file("b.spz", file(Format::Spz, Frame::Z_UP))]);
+    assert_eq!((two.status, two.error().contains("found 2")), (422, true), "{}", two.text());
+    let go = server.post_form(&[Part::file("a.ply", ply.clone()), Part::field("go", "{}")]);
+    assert_eq!((go.status, go.error().contains("`go`")), (422, true), "{}", go.text());
+    let mut large = splats().cloud;
+    (0..10_000).for_each(|i| large.push(&large.row(i % 40).to_owned()));
+    let large = encode(&Splats::from(large), Format::Ply, &WriteOptions::default()).unwrap().bytes;
+    for (name, bytes, words) in [
+        ("a.ply", ply[..ply.len() / 2].to_vec(), "a.ply"),
+        ("a.spz", b"no such thing".to_vec(), "a.spz"),
+        ("a.glb", file(Format::Spz, Frame::Z_UP), "a.glb"),
+        (
+            "a.ply",
+            encode(&Splats::from(Gaussians::default()), Format::Ply, &WriteOptions::default()).unwrap().bytes,
+            "no Gaussians",
+        ),
+        ("a.ply", large, "MB of memory"),
+    ] {
+        let reply = server.post_form(&[Part::file(name, bytes)]);
+        assert_eq!(reply.status, 201, "{}", reply.text());
+        let job = server.until(reply.json()["id"].as_str().unwrap(), &["done", "failed"]);
+        let error = job["error"].as_str().unwrap_or_default();
+        assert!(job["state"] == "failed" && error.contains(words) && !error.contains('/'), "{name}: {job}");
+    }
+    // Beside photos they are points of a capture, which nobody reads.
+    let server = Running::plain(Fake::quick());
+    let parts = [folder("bowl/"), vec![Part::file("bowl/points3D.ply", ply)]].concat();
+    let reply = server.post_form(&parts);
+    let job = server.until(reply.json()["id"].as_str().unwrap(), &["ready", "failed"]);
+    assert_eq!((&job["state"], &job["passed_over"]), (&"ready".into(), &serde_json::json!(["bowl/points3D.ply"])));
 }

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use freerange_gaussians::{
-    Gaussians,
+    Gaussians, Splats,
     formats::{Frame, WriteOptions, read, write},
 };
 use freerange_util::Note;
@@ -11,20 +11,28 @@ use glam::DVec3;
 
 use crate::{Error, error::Lift};
 
-/// Reads Gaussians (`.ply`, `.splat`, `.spz`, `.sog`, `.glb`, `.gltf`, `.usda`, `.usdz`). Formats that fix which way is up are
-/// turned so that `up` is. Color is what is the same from all sides; a note says what is left out.
+/// Reads Gaussians (`.ply`, `.splat`, `.spz`, `.sog`, `.glb`, `.gltf`, `.usda`, `.usdz`) with all that the file has of them. Formats
+/// that fix which way is up are turned so that `up` is.
 ///
 /// # Errors
 /// Names the file, the place in it, what was expected and what was found.
-pub fn read_gaussians(path: &Path, up: DVec3) -> Result<(Gaussians, Vec<Note>), Error> {
+pub fn read_splats(path: &Path, up: DVec3) -> Result<(Splats, Vec<Note>), Error> {
     let loaded = read(path, frame(up)?).lift()?;
-    let mut notes: Vec<Note> = loaded.notes.into_iter().map(Note::understood).collect();
-    let degree = loaded.splats.harmonics.degree();
+    Ok((loaded.splats, loaded.notes.into_iter().map(Note::understood).collect()))
+}
+
+/// The same without what depends on the viewing direction; a note says what is left out.
+///
+/// # Errors
+/// As [`read_splats`].
+pub fn read_gaussians(path: &Path, up: DVec3) -> Result<(Gaussians, Vec<Note>), Error> {
+    let (splats, mut notes) = read_splats(path, up)?;
+    let degree = splats.harmonics.degree();
     if degree > 0 {
         let text = format!("color that depends on the viewing direction (degree {degree}) is left out");
         notes.push(Note::dropped(text));
     }
-    Ok((loaded.splats.into_cloud(), notes))
+    Ok((splats.into_cloud(), notes))
 }
 
 /// Writes Gaussians in whose frame `up` is up; the notes say what the format could not hold. `.ply` keeps the Gaussians' own
@@ -32,10 +40,18 @@ pub fn read_gaussians(path: &Path, up: DVec3) -> Result<(Gaussians, Vec<Note>), 
 ///
 /// # Errors
 /// Names the file, or the extension that no format has.
-pub fn write_gaussians(gaussians: &Gaussians, path: &Path, up: DVec3) -> Result<Vec<Note>, Error> {
+pub fn write_splats(splats: &Splats, path: &Path, up: DVec3) -> Result<Vec<Note>, Error> {
     let options = WriteOptions { frame: frame(up)?, ..WriteOptions::default() };
-    let lost = write(&gaussians.clone().into(), path, &options).lift()?;
+    let lost = write(splats, path, &options).lift()?;
     Ok(lost.into_iter().map(Note::dropped).collect())
+}
+
+/// [`write_splats`] of Gaussians whose color is the same from all sides.
+///
+/// # Errors
+/// As there.
+pub fn write_gaussians(gaussians: &Gaussians, path: &Path, up: DVec3) -> Result<Vec<Note>, Error> {
+    write_splats(&gaussians.clone().into(), path, up)
 }
 
 fn frame(up: DVec3) -> Result<Frame, Error> {

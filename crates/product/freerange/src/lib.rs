@@ -69,10 +69,10 @@ pub use config::{
 };
 pub use device::{Device, DeviceInfo, DeviceName, DeviceProperties, GpuApi};
 pub use error::{Cause, Error};
-pub use files::{read_gaussians, write_gaussians};
+pub use files::{read_gaussians, read_splats, write_gaussians, write_splats};
 pub use frame::{choose_views, to_canonical, to_user};
 pub use freerange_diffusion::sample::{FlowConfig, RefinerConfig, SETTINGS_SCHEMA};
-pub use freerange_gaussians::{Gaussians, RenderMode, Splats};
+pub use freerange_gaussians::{Gaussians, Harmonics, RenderMode, Splats};
 pub use freerange_model::Compute;
 pub use freerange_optim::InitialFitConfig;
 pub use freerange_scene::camera::{Camera, CanonicalFrame, FrameConfig, Similarity, Up, View};

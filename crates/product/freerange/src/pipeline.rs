@@ -9,7 +9,7 @@
 //! 4. Refine: the network corrects each proposal ([`Refiner`](freerange_diffusion::sample::Refiner),
 //!    [`RefinerConfig`](crate::RefinerConfig)).
 //! 5. Optimize: photos decide where they look, the proposals' mean renders where none does
-//!    ([`freerange_optim::refine`], [`OptimizeConfig`](crate::OptimizeConfig)).
+//!    ([`freerange_optim::optimize`], [`OptimizeConfig`](crate::OptimizeConfig)).
 //!
 //! The result goes back to the user's frame.
 

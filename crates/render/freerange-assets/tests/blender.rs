@@ -1,4 +1,4 @@
-//! Our pictures of 21 real objects against those of Blender Cycles.
+//! Our renders of the 21 test objects against those of Blender Cycles.
 
 use std::path::PathBuf;
 

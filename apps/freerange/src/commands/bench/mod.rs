@@ -42,10 +42,10 @@ pub struct Args {
     /// Image sizes in pixels, for the rasterizer.
     #[arg(long, value_delimiter = ',', default_values_t = [224, 512])]
     pixels: Vec<u32>,
-    /// Steps of a whole reconstruction.
+    /// Euler steps of one sample from noise.
     #[arg(long, default_value_t = 50)]
     steps: usize,
-    /// Objects per batch of a whole reconstruction.
+    /// Objects per batch of samples from noise.
     #[arg(long, default_value_t = 1)]
     objects: usize,
     /// Precision of the transformer [default: bf16 where the device has it, else f32].
@@ -66,7 +66,7 @@ enum Part {
     Raster,
     /// Attention and one transformer block.
     Block,
-    /// Sampling steps and whole reconstructions.
+    /// Steps and whole samples from noise.
     Sample,
     /// Training steps.
     Train,

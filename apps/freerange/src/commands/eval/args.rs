@@ -53,7 +53,7 @@ pub struct RunArgs {
     /// Samples per object; reports have their means and their disagreement.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
     pub samples: u32,
-    /// Metrics; the report names those whose weights are missing.
+    /// Metrics. All but psnr and ssim need a build with `--features networks`. The report names those without weights.
     #[arg(
         long,
         value_delimiter = ',',

@@ -59,8 +59,7 @@ pub enum Method {
     Ply(PathBuf),
 }
 
-/// 3DGS-MCMC as a user without a model would run it, with rates chosen for long fits that start from the hull of a few
-/// masks.
+/// The baseline: 3DGS-MCMC on the input photos alone. Rates are for long fits that start from the hull of few masks.
 pub fn fit_config(iterations: usize, size: u32) -> FitConfig {
     FitConfig {
         iterations,

@@ -59,7 +59,7 @@ impl PictureArgs {
             if checkpoint.is_file() {
                 models.push(Reconstructor::load(&checkpoint, &EncoderPlaces::default(), &device)?);
             } else {
-                eprintln!("{row}: not in the picture, {} is not there", checkpoint.display());
+                eprintln!("{row}: not in the image, {} is not there", checkpoint.display());
             }
         }
         if models.is_empty() {

@@ -215,7 +215,7 @@ impl Judgement {
         let shown = match leave_one_out(&loaded.views, &Stop::default()) {
             Ok(shown) => shown,
             Err(e) => {
-                self.refused.push(format!("no picture of the object comes of these poses ({e})"));
+                self.refused.push(format!("these poses give no render of the object ({e})"));
                 return;
             }
         };

@@ -257,7 +257,7 @@ fn webp(pixels: &[u8], width: usize, height: usize) -> Vec<u8> {
         params.use_predictor_transform = predicted;
         encoder.set_params(params);
         let encoded = encoder.encode(pixels, width as u32, height as u32, ColorType::Rgba8);
-        encoded.expect("a picture of at most 4096 pixels' side");
+        encoded.expect("an image of at most 4096 pixels' side");
         bytes
     });
     encoded.into_iter().min_by_key(Vec::len).expect("two")

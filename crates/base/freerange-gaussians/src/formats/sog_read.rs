@@ -116,7 +116,7 @@ fn harmonics(meta: &Harmonic, files: &mut Files, count: usize) -> Result<Harmoni
     // Whole rows of pixels; the width is fixed, since centroids lie side by side.
     let (width, palette) = sized_picture(&meta.files[0], &palette, each * rows)?;
     if width != each * CENTROIDS {
-        return Err(problem(&meta.files[0], format!("a picture {} pixels wide", each * CENTROIDS), width));
+        return Err(problem(&meta.files[0], format!("an image {} pixels wide", each * CENTROIDS), width));
     }
     let labels = files.open(&meta.files[1])?;
     let labels = picture(&meta.files[1], &labels, count)?;
@@ -191,7 +191,7 @@ fn picture(name: &str, bytes: &[u8], count: usize) -> Result<Vec<[u8; 4]>, Inval
 /// The width of a picture, and its pixels, at least `count`.
 fn sized_picture(name: &str, bytes: &[u8], count: usize) -> Result<(usize, Vec<[u8; 4]>), Invalid> {
     let name: String = name.chars().take(60).collect();
-    let broken = |e: image_webp::DecodingError| problem(&*name, "a WebP picture", e);
+    let broken = |e: image_webp::DecodingError| problem(&*name, "a WebP image", e);
     let mut decoder = WebPDecoder::new(Cursor::new(bytes)).map_err(broken)?;
     let (width, height) = decoder.dimensions();
     let pixels = width as usize * height as usize;

@@ -44,7 +44,7 @@ impl Stage {
         let fits = |(image, view): (&RgbaImage, &View)| image.dimensions() == view.image.dimensions();
         match shown.len() == views.len() && shown.iter().zip(&cut_out).all(fits) {
             true => Ok(shown),
-            false => Err(format!("expected {} pictures of the views' sizes, found others", views.len())),
+            false => Err(format!("expected {} images of the views' sizes, found others", views.len())),
         }
     }
 
@@ -80,7 +80,7 @@ impl Stage {
             })
             .collect::<Result<_, SceneError>>()?;
         let outlines = self.outlines(&masks).ok_or_else(|| SceneError::NotCutOut {
-            reason: "no point of space lies within all masks once they are refined with what other views show".into(),
+            reason: "no point of space lies within all masks once they are corrected by the other views".into(),
         })?;
         Ok(Masks { masks, clearness: last.clearness.clone(), object, background: behind, outlines, shown })
     }

@@ -156,7 +156,7 @@ fn search(views: &[View], hints: &Hints, stop: &Stop) -> Result<Estimate, SceneE
             "the object stands on a plane that faces ({:.3}, {:.3}, {:.3})",
             plane.normal.x, plane.normal.y, plane.normal.z
         )),
-        None => notes.push("no plane beneath the object stands out: masks rest on colors and outlines alone".into()),
+        None => notes.push("no plane beneath the object stands out: masks rest on colors and silhouettes alone".into()),
     }
     let mut small = stage.take_turns()?;
     // Poses are judged by what photos say themselves.
@@ -168,7 +168,7 @@ fn search(views: &[View], hints: &Hints, stop: &Stop) -> Result<Estimate, SceneE
                 Ok(shown) => small = stage.refine(&small, shown)?,
                 Err(reason) => {
                     stop.check()?;
-                    notes.push(format!("masks are not refined with what other views show: {reason}"));
+                    notes.push(format!("masks are not corrected by the other views: {reason}"));
                     break;
                 }
             }

@@ -141,7 +141,7 @@ fn only_once(photos: &[Photo], masks: &[Option<PathBuf>]) -> Result<(), SceneErr
         if let Some(other) = seen.insert(mask, photo).filter(|other| other.image != photo.image) {
             return Err(SceneError::Mask {
                 name: mask.display().to_string(),
-                expected: "the mask of one photo (folders as the photos have them tell masks of one name apart)".into(),
+                expected: "the mask of one photo (masks of one name need the photos' folders)".into(),
                 found: format!("that of {} and {}", other.image.display(), photo.image.display()),
             });
         }

@@ -21,6 +21,8 @@ pub struct Submission {
     pub scene: SceneOptions,
     /// Computed as soon as it is read.
     pub go: Option<JobOptions>,
+    /// A file of Gaussians instead of photos.
+    pub splats: Option<PathBuf>,
     /// Files of no use.
     pub passed_over: Vec<String>,
     /// Bytes on disk.
@@ -48,10 +50,10 @@ impl Drop for Arriving<'_> {
 impl Arriving<'_> {
     /// Everything is there: it may be read.
     pub fn submit(mut self, submission: Submission) -> Result<String, Refusal> {
-        let Submission { title, scene, go, passed_over, bytes } = submission;
+        let Submission { title, scene, go, splats, passed_over, bytes } = submission;
         self.board.change(&self.id, |job| {
             (job.record.title, job.record.scene, job.record.passed_over) = (title, scene, passed_over);
-            (job.record.state, job.go, job.bytes) = (State::Reading, go, bytes);
+            (job.record.state, job.go, job.splats, job.bytes) = (State::Reading, go, splats, bytes);
             Ok(())
         })?;
         self.submitted = true;
@@ -69,18 +71,14 @@ impl Board {
                 j.record.state == State::Ready && j.touched.elapsed() > self.limits.idle_time && j.is_still()
             };
             let oldest = table.jobs.values().filter(idle).min_by_key(|j| j.touched).map(|j| j.record.id.clone());
-            let full = || {
-                Refusal::new(429, format!("{} jobs are open, which is all there is room for", self.limits.open_jobs))
-            };
+            let full = || Refusal::new(429, format!("{} jobs are open, which is the limit", self.limits.open_jobs));
             self.forget(&mut table, &oldest.ok_or_else(full)?);
         }
         let finished = |j: &&Job| !j.record.state.is_open();
         while table.jobs.values().filter(finished).count() >= self.limits.finished_jobs {
             if self.keeps {
-                let text = format!(
-                    "{} finished jobs are kept, which is all there is room for: remove some",
-                    self.limits.finished_jobs
-                );
+                let text =
+                    format!("{} finished jobs are kept, which is the limit: remove some", self.limits.finished_jobs);
                 return Err(Refusal::new(507, text));
             }
             match Self::oldest_finished(&table) {

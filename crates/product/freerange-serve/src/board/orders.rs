@@ -17,7 +17,7 @@ impl Board {
             table.turns += 1;
             let open = table.jobs.values().filter(|j| j.record.state.is_open() && j.record.id != id).count();
             if open >= self.limits.open_jobs {
-                return Err(Refusal::new(429, format!("{open} jobs are open, which is all there is room for")));
+                return Err(Refusal::new(429, format!("{open} jobs are open, which is the limit")));
             }
             table.turns
         };

@@ -17,15 +17,24 @@ use super::{
 use crate::{
     Refusal,
     disk::size_of,
-    record::State,
+    record::{SampleRecord, State},
     scene::{self, Preparation, SceneOptions},
+    splats,
 };
+
+/// What came of reading.
+struct Read {
+    understood: Value,
+    /// Number and up of Gaussians that were read: they are the result already.
+    result: Option<(usize, [f64; 3])>,
+}
 
 /// A job whose photos a thread reads.
 struct Unread {
     id: String,
     folder: PathBuf,
     options: SceneOptions,
+    splats: Option<PathBuf>,
     cancel: Arc<AtomicBool>,
 }
 
@@ -44,6 +53,7 @@ impl Board {
                     id: job.record.id.clone(),
                     folder: job.folder.clone(),
                     options: job.record.scene.clone(),
+                    splats: job.splats.take(),
                     cancel: job.cancel.clone(),
                 });
             }
@@ -69,13 +79,19 @@ impl Board {
                 (job.read_by_one, job.bytes) = (false, bytes);
                 if cancel.load(Relaxed) || job.record.state != State::Reading {
                     // Someone was faster; what was read is there all the same.
-                    if let Ok(understood) = read {
+                    if let Ok(Read { understood, .. }) = read {
                         job.record.understood = understood;
                     }
                     return Ok(());
                 }
                 match read {
-                    Ok(understood) => {
+                    Ok(Read { understood, result: Some((gaussians, up)) }) => {
+                        (job.record.understood, job.record.up) = (understood, up);
+                        job.record.samples = vec![SampleRecord { seed: 0, gaussians }];
+                        job.record.state = State::Done;
+                        self.metrics.ended(State::Done.name());
+                    }
+                    Ok(Read { understood, result: None }) => {
                         job.record.understood = understood;
                         job.record.state = State::Ready;
                         if let Some(options) = job.go.take() {
@@ -96,8 +112,13 @@ impl Board {
     }
 
     /// Reads the photos of one job; ends early when it is cancelled, and when its time is over.
-    fn read(&self, unread: &Unread) -> Result<Value, Refusal> {
-        let Unread { id, folder, options, cancel } = unread;
+    fn read(&self, unread: &Unread) -> Result<Read, Refusal> {
+        let Unread { id, folder, options, splats, cancel } = unread;
+        if let Some(file) = splats {
+            let found = splats::prepare(file, folder, options.up()?, &self.limits)?;
+            save_thumbnail(folder, &splats::thumbnail(&*self.engine, &found))?;
+            return Ok(Read { understood: found.understood, result: Some((found.gaussians, found.up)) });
+        }
         let stop = Stop::on(cancel.clone(), Some(Instant::now() + self.limits.read_time));
         let upload = uploads(folder).join("0/0/0");
         let understood = scene::prepare(&Preparation {
@@ -111,6 +132,6 @@ impl Board {
         })?;
         let first = image::open(scene::view_file(folder, 0)).map_err(Refusal::own)?.into_rgba8();
         save_thumbnail(folder, &on_white(&first))?;
-        Ok(understood)
+        Ok(Read { understood, result: None })
     }
 }

@@ -7,7 +7,7 @@ use std::{
 };
 
 use freerange_gaussians::formats::{Format, Frame, WriteOptions, encode};
-use freerange_gaussians::{read_ply, write_ply};
+use freerange_gaussians::read_ply;
 use freerange_util::write_atomically;
 use glam::DVec3;
 
@@ -100,20 +100,24 @@ impl Board {
         }
         let (shown, whole) = (sample_file(&folder, i), whole_file(&folder, i));
         let from = if whole.is_file() { &whole } else { &shown };
-        let cloud = read_ply(from).map_err(Refusal::own)?.splats.cloud;
+        let read = read_ply(from).map_err(Refusal::own)?;
+        let (cloud, splats) = (&read.splats.cloud, &read.splats);
         if kept.len() != cloud.len() || kept.iter().any(|v| *v > 1) {
             let text = format!("body: expected {} bytes, each 0 or 1, found {} bytes", cloud.len(), kept.len());
             return Err(Refusal::new(422, text));
         }
-        let chosen = cloud.select((0..kept.len()).filter(|k| kept[*k] == 1));
+        let chosen: Vec<usize> = (0..kept.len()).filter(|k| kept[*k] == 1).collect();
         if chosen.is_empty() {
             return Err(Refusal::new(422, "body: expected some Gaussians that are kept, found none"));
         }
         if !whole.is_file() {
-            write_ply(&cloud, &whole).map_err(Refusal::own)?;
+            fs::copy(&shown, &whole).map_err(Refusal::own)?;
         }
         write_atomically(&kept_file(&folder, i), |w| std::io::Write::write_all(w, kept)).map_err(Refusal::own)?;
-        write_ply(&chosen, &shown).map_err(Refusal::own)?;
+        let frame = read.up.and_then(Frame::with_up).unwrap_or_default();
+        let options = WriteOptions { frame, ..WriteOptions::default() };
+        let encoded = encode(&splats.select(&chosen), Format::Ply, &options).map_err(Refusal::own)?;
+        write_atomically(&shown, |w| std::io::Write::write_all(w, &encoded.bytes)).map_err(Refusal::own)?;
         self.change(id, |job| {
             if let Some(sample) = job.record.samples.get_mut(i) {
                 sample.gaussians = chosen.len();

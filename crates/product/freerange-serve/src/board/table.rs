@@ -44,6 +44,8 @@ pub(super) struct Job {
     pub(super) touched: Instant,
     /// Computed as soon as it is read.
     pub(super) go: Option<JobOptions>,
+    /// A file of Gaussians to be read instead of photos.
+    pub(super) splats: Option<PathBuf>,
     /// Whether a thread reads its photos.
     pub(super) read_by_one: bool,
     /// Bytes on disk.
@@ -78,6 +80,7 @@ impl Table {
             cancel: Arc::default(),
             touched: Instant::now(),
             go: None,
+            splats: None,
             read_by_one: false,
             bytes: 0,
             writing: Arc::default(),

@@ -19,7 +19,7 @@ const WORDS = { canonicalize: "finding the object", symmetry: "looking for symme
 /** @param {Status} s */
 const sentence = (s) => {
   switch (s.state) {
-    case "reading": return "The photos are read.";
+    case "reading": return "The files are read.";
     case "ready": return "Ready. Look at the masks, then press Go.";
     case "queued": return s.position ? `Waiting: ${s.position} before this one.` : "Waiting.";
     case "running": return s.stage ? `${WORDS[/** @type {keyof typeof WORDS} */ (s.stage)] ?? s.stage}: step ${s.done} of ${s.total}${left(s)}` : "Starting.";
@@ -81,9 +81,12 @@ export const showJob = () => {
     box("warnings").replaceChildren(...understood.warnings.map((text) => make("li", {}, text)));
     const passed = now.passed_over.length ? [`of no use here: ${now.passed_over.join(", ")}`] : [];
     const took = now.seconds.map(([stage, s]) => `${stage} ${s.toFixed(1)} s`).join(", ");
-    const notes = [`cameras: ${understood.format}, masks: ${understood.masks}`, ...understood.notes, ...passed, ...now.notes, ...(took ? [`it took ${took}`] : [])];
+    const what = understood.views.length ? `cameras: ${understood.format}, masks: ${understood.masks}` : `Gaussians of a file ${understood.format}`;
+    const notes = [what, ...understood.notes, ...passed, ...now.notes, ...(took ? [`it took ${took}`] : [])];
     box("notes").replaceChildren(...notes.map((text) => make("li", {}, text)));
-    get("sheet", HTMLAnchorElement).href = `/jobs/${now.id}/sheet.png`;
+    const sheet = get("sheet", HTMLAnchorElement);
+    sheet.href = `/jobs/${now.id}/sheet.png`;
+    sheet.hidden = !understood.views.length;
   } else {
     showPanes(0, { center: [0, 0, 0], radius: 1, up: [0, 0, 1], views: [], notes: [], warnings: [], format: "", masks: "" });
   }

@@ -7,6 +7,8 @@ import { app } from "./state.js";
 
 const OF_USE = /\.(png|jpe?g|webp|json|bin|txt|xml|csv)$/i;
 const PHOTO = /\.(png|jpe?g|webp)$/i;
+/** Gaussians, to be looked at and converted. */
+const SPLATS = /\.(ply|splat|spz|sog|glb|usd[az])$/i;
 /** Photos that nobody here can read. */
 const OTHERS = /\.(heic|heif|avif|tiff?|dng|raw|cr[23]|nef|arw|exr|mp4|mov)$/i;
 /** What lies in captures and is not read: smaller copies, points, a data base. */
@@ -32,6 +34,11 @@ const chosenOf = (picked) => {
   const fine = seen.filter(({ path }) => OF_USE.test(path) && !UNREAD.test(path)), others = seen.filter(({ path }) => OTHERS.test(path));
   if (others.length && !fine.some(({ path }) => PHOTO.test(path))) {
     throw new Error(`${others.length} photos are ${others[0].path.split(".").pop()?.toUpperCase()} files, which cannot be read here: save them as JPEG or PNG`);
+  }
+  if (!fine.length) {
+    const splats = seen.filter(({ path }) => SPLATS.test(path));
+    if (splats.length > 1) throw new Error(`these are ${splats.length} files of Gaussians: one at a time`);
+    fine.push(...splats);
   }
   if (!fine.length) throw new Error("no photos and no cameras are among these files");
   const limits = app.limits, bytes = fine.reduce((sum, { file }) => sum + file.size, 0);

@@ -1,11 +1,11 @@
 //! Step 5, optimize. In: refined proposals and all targets. Out: one set of Gaussians, up to
 //! [`max_gaussians`](crate::OptimizeConfig::max_gaussians), by 3DGS-MCMC on the photos from all proposals together. Where no
-//! photo looks, the mean renders of the proposals hold it ([`freerange_optim::refine`]; docs/research/experiments/proposals.md).
+//! photo looks, the mean renders of the proposals anchor it ([`freerange_optim::optimize`]; docs/research/experiments/proposals.md).
 //!
 //! Cost: half of the pipeline's time; memory of the photos at `max_resolution`.
 
 use freerange_gaussians::Gaussians;
-use freerange_optim::{HoldConfig, RefineConfig, refine};
+use freerange_optim::{AnchorConfig, OptimizationConfig};
 
 use super::{CanonicalScene, symmetry::Targets, watch::Watch};
 use crate::{Error, OptimizeConfig, Stage};
@@ -24,15 +24,15 @@ pub(crate) fn optimize(
         return Ok(first.clone());
     }
     // What several agree on is held more firmly than a guess.
-    let hold = match others.is_empty() {
-        true => HoldConfig::default(),
-        false => HoldConfig { weight: 0.3, views: 24, ..HoldConfig::default() },
+    let anchors = match others.is_empty() {
+        true => AnchorConfig::default(),
+        false => AnchorConfig { weight: 0.3, views: 24, ..AnchorConfig::default() },
     };
-    let steps = RefineConfig { steps: config.iterations, hold, seed, ..RefineConfig::default() };
+    let steps = OptimizationConfig { steps: config.iterations, anchors, seed, ..OptimizationConfig::default() };
     let evidence = targets.of_optimization();
     let side = evidence.views.iter().map(|view| view.image.width().max(view.image.height())).max().unwrap_or(0);
     let steps = steps.detailed(config.detail(), side).for_photos(targets.photos());
     watch.fit(Stage::Optimize, steps.steps, &scene.canonical_from_user, |progress| {
-        refine(first, others, evidence, &steps, progress)
+        freerange_optim::optimize(first, others, evidence, &steps, progress)
     })
 }

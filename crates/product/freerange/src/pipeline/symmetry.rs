@@ -8,7 +8,7 @@
 use std::ops::ControlFlow;
 
 use freerange_optim::{
-    Axis, Evidence, FoundAxis, FoundMirror, Mirror, Outline, axis_steps, find_axis, find_mirror, mirror_steps,
+    Axis, Evidence, FoundAxis, FoundMirror, Mirror, Silhouette, axis_steps, find_axis, find_mirror, mirror_steps,
     mirrored, turned,
 };
 use freerange_scene::camera::View;
@@ -127,7 +127,7 @@ impl Targets {
 
     /// What initial fits agree with.
     pub fn of_fits(&self) -> Evidence<'_> {
-        Evidence { views: &self.network, outlines: self.silhouettes(&self.network[..self.network_photos]) }
+        Evidence { views: &self.network, silhouettes: self.silhouettes(&self.network[..self.network_photos]) }
     }
 
     /// How many photos there are, without what a symmetry adds.
@@ -137,11 +137,11 @@ impl Targets {
 
     /// What the optimization agrees with.
     pub fn of_optimization(&self) -> Evidence<'_> {
-        Evidence { views: &self.views, outlines: self.silhouettes(&self.views[..self.photos]) }
+        Evidence { views: &self.views, silhouettes: self.silhouettes(&self.views[..self.photos]) }
     }
 
     /// Silhouettes of `photos` rotated about the axis, if there is one.
-    fn silhouettes<'a>(&self, photos: &'a [View]) -> Vec<Outline<'a>> {
+    fn silhouettes<'a>(&self, photos: &'a [View]) -> Vec<Silhouette<'a>> {
         self.axis.as_ref().map_or_else(Vec::new, |axis| turned(photos, axis))
     }
 }

@@ -223,11 +223,11 @@ pub fn nearest_point(lines: &[(DVec3, DVec3)]) -> Result<DVec3, CameraError> {
 fn from_silhouettes(silhouettes: &[Silhouette], start: DVec3) -> Result<(DVec3, f64), CameraError> {
     let seen = |center: DVec3| silhouettes.iter().map(|s| s.radius(center)).fold(0.0, f64::max);
     let hull = Hull::carve(silhouettes, start, 2.0 * seen(start)).ok_or_else(|| {
-        CameraError::Frame("no point of space lies inside all masks: poses and images contradict each other".into())
+        CameraError::Frame("no point of space lies inside all masks: poses and images disagree".into())
     })?;
     // Seen from one side only, the hull is a long wedge and its middle says little; the lines of sight do better. The
     // mean line of sight is short where cameras stand all around, and near 1 where they stand together. The bounds
-    // are measured: on 21 scanned objects the hull is twice as good at 0.17, the lines four times at 0.91.
+    // are measured: on the 21 test objects the hull is twice as good at 0.17, the lines four times at 0.91.
     let one_sided = silhouettes.iter().map(|s| s.towards).sum::<DVec3>().length() / silhouettes.len() as f64;
     let t = ((one_sided - 0.4) / 0.45).clamp(0.0, 1.0);
     let center = hull.box_center.lerp(start, t * t * (3.0 - 2.0 * t));

@@ -31,7 +31,7 @@ fn near(p: &Rgba<u8>, background: [u8; 3]) -> bool {
 pub fn cut_out(image: &RgbaImage) -> Result<(RgbaImage, [u8; 3]), String> {
     let (w, h) = image.dimensions();
     if w < 8 || h < 8 {
-        return Err(format!("an image of {w} x {h} pixels, too small to tell"));
+        return Err(format!("an image of {w} x {h} pixels, too small to judge"));
     }
     let shown: Vec<bool> = image.pixels().map(|p| p[3] >= 128).collect();
     let found = backdrop(image, &shown);

@@ -12,12 +12,12 @@ use crate::mesh::error::MeshError;
 pub fn decode(job: &mut Job, name: &str, bytes: &[u8]) -> Result<RgbaImage, MeshError> {
     let mut reader = ImageReader::new(Cursor::new(bytes))
         .with_guessed_format()
-        .map_err(|e| job.error(name, "a readable picture", e))?;
+        .map_err(|e| job.error(name, "a readable image", e))?;
     match reader.format() {
         Some(ImageFormat::Png | ImageFormat::Jpeg | ImageFormat::WebP) => {}
         other => {
             let found = other.map_or("another format".to_owned(), |f| format!("{f:?}"));
-            return Err(job.error(name, "a PNG, JPEG or WebP picture", found));
+            return Err(job.error(name, "a PNG, JPEG or WebP image", found));
         }
     }
     let mut limits = Limits::no_limits();
@@ -29,11 +29,11 @@ pub fn decode(job: &mut Job, name: &str, bytes: &[u8]) -> Result<RgbaImage, Mesh
     reader.limits(limits);
     let broken = |e: image::ImageError| {
         let side = job.limits.max_texture_side;
-        job.error(name, format!("a whole picture of at most {side} pixels a side (max_texture_side)"), e)
+        job.error(name, format!("a whole image of at most {side} pixels a side (max_texture_side)"), e)
     };
     let decoder = reader.into_decoder().map_err(&broken)?;
     let (width, height) = decoder.dimensions();
     job.charge_pixels(name, [width, height])?;
-    let picture = DynamicImage::from_decoder(decoder).map_err(|e| job.error(name, "a whole picture", e))?;
+    let picture = DynamicImage::from_decoder(decoder).map_err(|e| job.error(name, "a whole image", e))?;
     Ok(picture.into_rgba8())
 }

@@ -1,6 +1,6 @@
-//! What keeps a refinement where no photo looks: pictures of the cloud as it was before.
+//! What keeps an optimization where no photo looks: pictures of the cloud as it was before.
 
-use crate::{FitError, HoldConfig, objective::Objective};
+use crate::{AnchorConfig, FitError, objective::Objective};
 use freerange_gaussians::Gaussians;
 use freerange_raster::{RasterConfig, render, render_backward};
 use freerange_scene::camera::Camera;
@@ -18,7 +18,7 @@ const FULL_SIZE: f32 = 512.0;
 const EQUAL: f32 = 1e-6;
 
 /// Pictures of one cloud, or the mean of several, from all around it.
-pub(crate) struct Hold {
+pub(crate) struct Anchors {
     pictures: Vec<Picture>,
     raster: RasterConfig,
     weight: f64,
@@ -43,9 +43,9 @@ fn around(views: usize, size: u32, radius: f64) -> impl Iterator<Item = Camera> 
     })
 }
 
-impl Hold {
+impl Anchors {
     /// The mean pictures of `clouds`; none where they would have no weight.
-    pub fn new(clouds: &[Gaussians], config: &HoldConfig) -> Result<Self, FitError> {
+    pub fn new(clouds: &[Gaussians], config: &AnchorConfig) -> Result<Self, FitError> {
         let raster = RasterConfig::default().shrunk(config.size as f32 / FULL_SIZE);
         let pixels = (config.size * config.size) as usize;
         let share = 1.0 / clouds.len() as f32;

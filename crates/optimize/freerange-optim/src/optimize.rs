@@ -1,9 +1,9 @@
 //! 3DGS-MCMC that goes on from a cloud that is already good: what a generated sample needs to agree with the photos.
 
 use crate::{
-    Evidence, FitError, FitProgress, RefineConfig,
-    fit::{checked, next_views, optimize},
-    hold::Hold,
+    Evidence, FitError, FitProgress, OptimizationConfig,
+    anchors::Anchors,
+    fit::{checked, descend, next_views},
     mcmc::split,
     objective::Objective,
     views::Targets,
@@ -13,26 +13,26 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use std::ops::ControlFlow;
 
-/// Longest side, in pixels, of outlines. They come from guesses, which nobody vouches for to the pixel.
-const OUTLINES: u32 = 128;
+/// Longest side, in pixels, of silhouettes. They come from guesses, which nobody vouches for to the pixel.
+const SILHOUETTES: u32 = 128;
 /// Improves a cloud's agreement with posed views, and shows more detail by more Gaussians.
 ///
-/// Few views say little of the rest of the object, and Gaussians that only they judge leave the object's surface. Hence a
-/// [`Hold`](crate::HoldConfig): at every step, a picture of the cloud as it was, from somewhere around the object, is one
+/// Few views say little of the rest of the object, and Gaussians that only they judge leave the object's surface. Hence
+/// [anchors](crate::AnchorConfig): at every step, a picture of the cloud as it was, from somewhere around the object, is one
 /// more view to agree with, though less. `others` are more clouds of the same object. These pictures are the mean of all:
-/// where guesses differ, their mean is nearer to the truth than most. For the same reason the refinement begins with as many
+/// where guesses differ, their mean is nearer to the truth than most. For the same reason the optimization begins with as many
 /// of them in one place as there are to be Gaussians, each fainter, so that together they show about what one alone does.
-/// Outlines, where there are any, come beside the views at every other step.
+/// Silhouettes, where there are any, come beside the views at every other step.
 /// `progress` hears of every step, and ends with what there is by `ControlFlow::Break`. The same input gives the same bytes.
 ///
 /// # Errors
 /// If there are no views, or they differ in size from their camera; if the configuration is impossible;
 /// if the cloud is empty or not finite; or if the optimization diverges.
-pub fn refine<'a>(
+pub fn optimize<'a>(
     cloud: &Gaussians,
     others: &[Gaussians],
     seen: impl Into<Evidence<'a>>,
-    config: &RefineConfig,
+    config: &OptimizationConfig,
     progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Gaussians, FitError> {
     config.check()?;
@@ -40,35 +40,36 @@ pub fn refine<'a>(
     let targets = Targets::new(seen.views, config.render_size)?;
     let first = (config.coarse * config.steps as f64) as usize;
     let coarse = (first > 0).then(|| Targets::new(seen.views, Some(config.coarse_size))).transpose()?;
-    let further = seen.outlines.len();
-    let size = config.render_size.map_or(OUTLINES, |size| size.min(OUTLINES));
-    let outlines = (further > 0).then(|| Targets::new(seen, Some(size))).transpose()?;
+    let further = seen.silhouettes.len();
+    let size = config.render_size.map_or(SILHOUETTES, |size| size.min(SILHOUETTES));
+    let silhouettes = (further > 0).then(|| Targets::new(seen, Some(size))).transpose()?;
     let clouds = std::iter::once(cloud).chain(others).map(|cloud| checked(cloud, usize::MAX));
     let clouds = clouds.collect::<Result<Vec<_>, _>>()?;
-    let hold = Hold::new(&clouds, &config.hold)?;
+    let anchors = Anchors::new(&clouds, &config.anchors)?;
     let start = together(&clouds, config.gaussians);
     let fit = config.fit(start.len());
     fit.check()?;
     let mut rng = ChaCha8Rng::seed_from_u64(config.seed);
-    // A stream of its own: the photos come in the same order with and without a hold.
-    let mut hold_rng = ChaCha8Rng::seed_from_u64(config.seed);
-    hold_rng.set_stream(1);
+    // A stream of its own: the photos come in the same order with and without anchors.
+    let mut anchor_rng = ChaCha8Rng::seed_from_u64(config.seed);
+    anchor_rng.set_stream(1);
     let mut queue = Vec::new();
-    // Photos have more to tell here than shape: outlines come beside them, at every other step.
-    let (mut outline_queue, mut step) = (Vec::new(), 0);
+    // Photos have more to tell here than shape: silhouettes come beside them, at every other step.
+    let (mut silhouette_queue, mut step) = (Vec::new(), 0);
     let more = |cloud: &Gaussians, background| {
         step += 1;
-        let outlined = outlines.as_ref().filter(|_| step % 2 == 0);
-        let outlined = outlined.map(|targets| (targets, next_views(&mut outline_queue, further, 1, &mut hold_rng)));
-        let held = next_views(&mut queue, hold.views(), 1, &mut hold_rng);
-        let (outlined, held) = rayon::join(
-            || outlined.map(|(targets, chosen)| Objective::outlines(cloud, targets, &chosen)).transpose(),
-            || held.first().map(|&view| hold.objective(cloud, view, background)).transpose(),
+        let by_silhouette = silhouettes.as_ref().filter(|_| step % 2 == 0);
+        let by_silhouette =
+            by_silhouette.map(|targets| (targets, next_views(&mut silhouette_queue, further, 1, &mut anchor_rng)));
+        let held = next_views(&mut queue, anchors.views(), 1, &mut anchor_rng);
+        let (by_silhouette, held) = rayon::join(
+            || by_silhouette.map(|(targets, chosen)| Objective::silhouettes(cloud, targets, &chosen)).transpose(),
+            || held.first().map(|&view| anchors.objective(cloud, view, background)).transpose(),
         );
-        Ok(outlined?.into_iter().chain(held?).collect())
+        Ok(by_silhouette?.into_iter().chain(held?).collect())
     };
     let of_step = |step| coarse.as_ref().filter(|_| step < first).unwrap_or(&targets);
-    optimize(start, of_step, &fit, &mut rng, more, progress)
+    descend(start, of_step, &fit, &mut rng, more, progress)
 }
 
 /// As many of `clouds` as `most` Gaussians allow, but the first in any case, in one place. Each Gaussian becomes what relocation
