@@ -94,7 +94,10 @@ class FreeRangeProcessor(Processor):
             raise TypeError(f"{', '.join(options)}: expected no options but masks")
         views.require("intrinsics", "c2w", by="freerange")
         images = views.images.permute(0, 1, 3, 4, 2).cpu().float().numpy()  # [b, v, h, w, 3]
-        poses, k = views.c2w.cpu().double().numpy(), views.cameras.pixel_k.cpu().double().numpy()
+        poses = views.c2w.cpu().double().numpy()
+        # As they were given: `pixel_k` rounds them to 32 bits.
+        exact = views.cameras.pixel_k if views.normalized_intrinsics else views.intrinsics
+        k = exact.cpu().double().numpy()
         listed: list[Any] = [None] * len(images)
         if masks is not None:
             given = _check.array("masks", masks.cpu() if isinstance(masks, torch.Tensor) else masks, "biuf")

@@ -364,7 +364,10 @@ fn files_of_gaussians_that_cannot_be_shown_are_refused() {
     let go = server.post_form(&[Part::file("a.ply", ply.clone()), Part::field("go", "{}")]);
     assert_eq!((go.status, go.error().contains("`go`")), (422, true), "{}", go.text());
     let mut large = splats().cloud;
-    (0..10_000).for_each(|i| large.push(&large.row(i % 40).to_owned()));
+    for i in 0..10_000 {
+        let row = *large.row(i % 40);
+        large.push(&row);
+    }
     let large = encode(&Splats::from(large), Format::Ply, &WriteOptions::default()).unwrap().bytes;
     for (name, bytes, words) in [
         ("a.ply", ply[..ply.len() / 2].to_vec(), "a.ply"),
