@@ -9,20 +9,9 @@ use pyo3::{
     exceptions::{PyOSError, PyRuntimeError, PyValueError},
 };
 
-/// An error with its causes, each told once.
+/// An error with its causes.
 fn told(error: &(dyn Error + 'static)) -> String {
-    let mut last = error.to_string();
-    let mut text = last.clone();
-    let mut cause = error.source();
-    while let Some(e) = cause {
-        let next = e.to_string();
-        if !last.contains(&next) {
-            text += &format!(": {next}");
-            last = next;
-        }
-        cause = e.source();
-    }
-    text
+    freerange_util::with_causes(error, ": ")
 }
 
 /// `OSError` where the system refused a file.

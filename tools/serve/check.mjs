@@ -355,6 +355,15 @@ try {
   await state("interrupted", 30);
   check("kill -9 and start again", true, await evaluate("document.getElementById('status').textContent"));
   await picture("interrupted");
+
+  // A file of Gaussians is shown, and offered in every format.
+  // Anywhere on the page.
+  const one = { items: [], files: [ply], dragOperationsMask: 1 };
+  for (const type of ["dragEnter", "dragOver", "drop"]) await send("Input.dispatchDragEvent", { type, x, y, data: one });
+  await until(`location.hash.slice(5) !== ${JSON.stringify(id)} && document.body.dataset.state === "done" && window.viewers[0]?.count === ${all}`, 60);
+  check("a dropped file of Gaussians", await evaluate("document.querySelectorAll('#downloads a').length") === job.formats.length, await evaluate("document.getElementById('notes').textContent"));
+  await accessible("with a file of Gaussians");
+  await picture("splats");
   const left = ended(program);
   program.kill("SIGTERM");
   check("asked to end", await Promise.race([left, wait(20_000).then(() => "still there")]) === 0, "exit code 0");

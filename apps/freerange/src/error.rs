@@ -7,7 +7,7 @@ use freerange_data::build::BuildError;
 use freerange_diffusion::FlowError;
 use freerange_optim::FitError;
 use freerange_train::TrainError;
-use freerange_util::system_failed;
+use freerange_util::{system_failed, with_causes};
 
 /// What shells expect of a program that a signal has ended, if it is Ctrl-C.
 pub const EXIT_CODE: u8 = 130;
@@ -66,19 +66,7 @@ impl CliError {
 
 impl fmt::Display for CliError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let mut last = self.source.to_string();
-        f.write_str(&last)?;
-        let mut cause = self.source.source();
-        while let Some(e) = cause {
-            let text = e.to_string();
-            // Many an error names its cause itself.
-            if !last.contains(&text) {
-                write!(f, "\n  because: {text}")?;
-                last = text;
-            }
-            cause = e.source();
-        }
-        Ok(())
+        f.write_str(&with_causes(self.cause(), "\n  because: "))
     }
 }
 

@@ -233,15 +233,23 @@ fn literals(tokens: TokenStream, found: &mut Vec<String>) {
     }
 }
 
-/// Errors, notes and labels: texts of three words or more in the program's sources.
+/// Errors, notes and labels: texts of three words or more in the sources of program and crates.
 #[test]
 fn messages_use_the_words_of_the_field() {
     let mut wrong = Vec::new();
-    for source in files(&["rs"]).into_iter().filter(|s| s.name.starts_with("apps/freerange/src/")) {
+    let of_tests = |name: &str| name.ends_with("tests.rs") || name.contains("/tests/");
+    let of_program = |name: &str| name.starts_with("crates/") && name.contains("/src/") && !of_tests(name);
+    let sources =
+        files(&["rs"]).into_iter().filter(|s| s.name.starts_with("apps/freerange/src/") || of_program(&s.name));
+    for source in sources {
+        let code = source.text.split("#[cfg(test)]\nmod tests").next().unwrap_or_default();
         let mut texts = Vec::new();
-        literals(source.text.parse().unwrap(), &mut texts);
+        literals(code.parse().unwrap(), &mut texts);
         for text in texts.iter().filter(|t| t.split_whitespace().count() >= 3) {
-            wrong.extend(retired(text).into_iter().map(|w| format!("{}: {w} in {text}", source.name)));
+            // Names of variables are no words.
+            let parts = text.split('{').map(|part| part.split_once('}').map_or(part, |(_, after)| after));
+            let words = parts.collect::<Vec<_>>().join(" ");
+            wrong.extend(retired(&words).into_iter().map(|w| format!("{}: {w} in {text}", source.name)));
         }
     }
     // The test's own list is no message.

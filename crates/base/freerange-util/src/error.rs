@@ -56,6 +56,23 @@ impl IoError {
     }
 }
 
+/// An error and its causes in one line, `between` two of them. Many an error names its cause itself: it is not repeated.
+pub fn with_causes(error: &(dyn Error + 'static), between: &str) -> String {
+    let mut text = error.to_string();
+    let mut last = text.clone();
+    let mut cause = error.source();
+    while let Some(e) = cause {
+        let next = e.to_string();
+        if !last.contains(&next) {
+            text += between;
+            text += &next;
+            last = next;
+        }
+        cause = e.source();
+    }
+    text
+}
+
 /// Whether the system failed below an error: a full disk, a lost connection. Not where another path, or another file there,
 /// would help.
 pub fn system_failed(error: &(dyn Error + 'static)) -> bool {
@@ -94,6 +111,24 @@ fn is_about_input(kind: io::ErrorKind) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[derive(Debug, thiserror::Error)]
+    #[error("{text}")]
+    struct Outer {
+        text: String,
+        source: IoError,
+    }
+
+    #[test]
+    fn causes_are_named_once() {
+        let error = std::fs::read("none/there").map_err(IoError::at(Path::new("none/there"))).unwrap_err();
+        let inner = error.to_string();
+        assert_eq!(with_causes(&error, " < "), inner, "it names its cause itself");
+        let outer = Outer { text: "the photos".into(), source: error };
+        assert_eq!(with_causes(&outer, " < "), format!("the photos < {inner}"));
+        let names = Outer { text: format!("the photos: {inner}"), source: outer.source };
+        assert_eq!(with_causes(&names, " < "), format!("the photos: {inner}"));
+    }
 
     #[test]
     fn errors_name_field_and_file() {

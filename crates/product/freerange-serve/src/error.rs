@@ -45,16 +45,5 @@ impl Refusal {
 
 /// A cause and all that lies beneath it.
 pub(crate) fn chain(error: &(dyn std::error::Error + 'static)) -> String {
-    let mut text = error.to_string();
-    let mut last = text.clone();
-    let mut cause = error.source();
-    while let Some(e) = cause {
-        let more = e.to_string();
-        if !last.contains(&more) {
-            text += &format!("; because: {more}");
-            last = more;
-        }
-        cause = e.source();
-    }
-    text
+    freerange_util::with_causes(error, "; because: ")
 }

@@ -266,7 +266,10 @@ fn bytes_pixels_files_and_jobs_have_limits() {
     assert!(post(&[Part::file("a.png", picture)]).1.contains("at most 300000 pixels"));
     let (status, error) = post(&folder(""));
     assert!(status == 413 && error.contains("900000 pixels together"), "{error}");
-    assert_eq!(post(&[Part::field("scene", "{}")]).1, "expected files of photos and cameras, found none");
+    assert_eq!(
+        post(&[Part::field("scene", "{}")]).1,
+        "expected files of photos and cameras, or one of Gaussians, found none"
+    );
     assert_eq!(post(&[Part::field("example", "nothing")]).0, 404);
     assert_eq!(post(&[Part::field("scene", r#"{"masks": "magic"}"#), Part::file("a.txt", "x")]).0, 422);
     assert_eq!(post(&[Part::field("go", r#"{"samples": 9}"#), Part::file("a.txt", "x")]).0, 422);

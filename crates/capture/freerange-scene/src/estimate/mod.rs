@@ -115,7 +115,7 @@ impl Estimate {
         let worst = (0..views.len()).min_by(|a, b| self.agreement[*a].total_cmp(&self.agreement[*b])).unwrap_or(0);
         Some(format!(
             "the views contradict each other ({found}; {} agrees least): the poses may be wrong or belong to other photos, or the object \
-             moved, or it cannot be told from the background",
+             moved, or it looks like the background",
             views[worst].name
         ))
     }

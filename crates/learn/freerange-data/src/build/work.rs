@@ -12,7 +12,7 @@ use std::time::Instant;
 use crate::layout::{END, ObjectBytes, object_bytes, record_name, shard_name, to_json};
 use crate::{DataError, Failure, HeldOutPsnr, Metadata, Object, ObjectRecord, Plan, ShardRecord, Split, Store};
 use freerange_gaussians::Statistics;
-use freerange_util::{Invalid, IoError};
+use freerange_util::{Invalid, IoError, with_causes};
 
 use crate::build::item_object::{FileFacts, evaluation, seed_of, split_of};
 use crate::build::items::{Item, Items};
@@ -254,7 +254,7 @@ where
     #[allow(clippy::type_complexity, reason = "named once, used once")]
     fn encoded(&self, item: &Item, shard: &str) -> Result<(Vec<u8>, Outcome, Option<HeldOutPsnr>, Seconds), String> {
         let config = self.config;
-        let (mut made, facts) = (self.make)(item).map_err(|e| chain(&e))?;
+        let (mut made, facts) = (self.make)(item).map_err(|e| with_causes(&e, ": "))?;
         let start = Instant::now();
         let seed = seed_of(item, config);
         let flagged = made.psnr.as_ref().is_some_and(|p| p.leaves < config.shard.min_psnr);
@@ -271,12 +271,12 @@ where
             psnr: made.psnr.clone(),
             flagged,
             input_fits: made.object.input_fits.iter().map(|f| f.views.clone()).collect(),
-            evaluation: evaluation(&made.object.views, config, seed).map_err(|e| chain(&e))?,
+            evaluation: evaluation(&made.object.views, config, seed).map_err(|e| with_causes(&e, ": "))?,
         };
-        let statistics = statistics_of(&made.object, &config.depths).map_err(|e| chain(&e))?;
+        let statistics = statistics_of(&made.object, &config.depths).map_err(|e| with_causes(&e, ": "))?;
         let leaves = config.shard.leaves.then_some(&made.leaves);
         let bytes = object_bytes(&made.object, leaves, &metadata, config.shard.images, Path::new(shard));
-        let bytes = bytes.map_err(|e| chain(&e))?;
+        let bytes = bytes.map_err(|e| with_causes(&e, ": "))?;
         add_elapsed(&mut made.seconds.write, start);
         let psnr = made.psnr.as_ref().map(|p| p.leaves);
         Ok((bytes, Outcome::Built { split: metadata.split, psnr, flagged, statistics }, made.psnr, made.seconds))
@@ -359,15 +359,4 @@ fn statistics_of(object: &Object, depths: &[u32]) -> Result<BTreeMap<u32, Statis
         Ok((depth, statistics))
     };
     depths.iter().map(of_depth).collect()
-}
-
-/// An error with its causes, in one line.
-fn chain(error: &dyn std::error::Error) -> String {
-    let mut text = error.to_string();
-    let mut cause = error.source();
-    while let Some(e) = cause {
-        text += &format!(": {e}");
-        cause = e.source();
-    }
-    text
 }
