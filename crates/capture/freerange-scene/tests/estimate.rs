@@ -174,7 +174,7 @@ fn masks_stay_as_they_are_where_other_views_show_nothing() {
     let fails: LeaveOneOut = |_, _| Err("it is dark".into());
     let small: LeaveOneOut = |views, _| Ok(vec![RgbaImage::new(3, 2); views.len()]);
     let fewer: LeaveOneOut = |views, _| Ok(views[1..].iter().map(|v| v.image.clone()).collect());
-    for (others, words) in [(fails, "it is dark"), (small, "expected 8 pictures"), (fewer, "expected 8 pictures")] {
+    for (others, words) in [(fails, "it is dark"), (small, "expected 8 images"), (fewer, "expected 8 images")] {
         let found = of(&views, Some(others));
         assert_eq!(found.alpha, plain.alpha);
         let told: Vec<&String> = found.notes.iter().filter(|n| !plain.notes.contains(n)).collect();

@@ -170,7 +170,7 @@ fn views_that_place_nothing_are_refused() {
     // Masks of a ball that is somewhere else for each camera.
     let places = [DVec3::new(0.0, 0.0, 0.8), DVec3::new(0.0, 0.0, -0.8), DVec3::new(0.0, 0.0, 0.6), DVec3::ZERO];
     let torn: Vec<View> = around.iter().zip(places).map(|(c, p)| ball(*c, p, 0.1)).collect();
-    says(&torn, "contradict");
+    says(&torn, "disagree");
 }
 
 /// Objects of radius 0.5 at the origin, rendered from 1.5 away.
