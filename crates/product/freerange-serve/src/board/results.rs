@@ -111,7 +111,8 @@ impl Board {
             return Err(Refusal::new(422, "body: expected some Gaussians that are kept, found none"));
         }
         if !whole.is_file() {
-            fs::copy(&shown, &whole).map_err(Refusal::own)?;
+            let all = fs::read(&shown).map_err(Refusal::own)?;
+            write_atomically(&whole, |w| std::io::Write::write_all(w, &all)).map_err(Refusal::own)?;
         }
         write_atomically(&kept_file(&folder, i), |w| std::io::Write::write_all(w, kept)).map_err(Refusal::own)?;
         let frame = read.up.and_then(Frame::with_up).unwrap_or_default();
