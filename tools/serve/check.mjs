@@ -5,7 +5,7 @@
 //
 // Needs Chromium ($CHROMIUM, or `chromium` on the path). With $PICTURES, pictures of every state are written there.
 import { execFileSync, spawn } from "node:child_process";
-import { mkdirSync, mkdtempSync, readFileSync, rmSync, writeFileSync } from "node:fs";
+import { cpSync, mkdirSync, mkdtempSync, readFileSync, rmSync, writeFileSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join, resolve } from "node:path";
 import { browser, serve } from "../formats/browser.mjs";
@@ -22,9 +22,17 @@ const check = (name, ok, found) => {
 const told = (name, found) => console.log(`        ${name}: ${found}`);
 const wait = (ms) => new Promise((done) => setTimeout(done, ms));
 
+/** Stands for a Python with pycolmap: places no photo. */
+const engine = join(folder, "python");
+writeFileSync(engine, `#!/bin/sh
+if [ "$1" = -c ]; then echo 0.0-test; exit 0; fi
+echo '{"step": "features", "done": 0}'
+sleep 2
+echo '{"engine": "test", "models": [], "pairs": null, "points": 0}' > "$(dirname "$2")/result.json"
+`, { mode: 0o755 });
 /** Starts the program; resolves when it has told its address, with the token that it has drawn. Few steps from noise: the page is checked, not the samples. */
 const start = () => new Promise((done, fail) => {
-  const program = spawn(command, ["serve", "--port", "0", "--keep", keep, "--device", "cpu", "--set", "propose.flow.steps=8"], { stdio: ["ignore", "pipe", "inherit"] });
+  const program = spawn(command, ["serve", "--port", "0", "--keep", keep, "--device", "cpu", "--python", engine, "--set", "propose.flow.steps=8"], { stdio: ["ignore", "pipe", "inherit"] });
   let text = "";
   program.on("error", fail);
   program.on("exit", (code, signal) => fail(new Error(`freerange serve ended: ${code ?? signal}`)));
@@ -122,6 +130,32 @@ try {
   check("a dropped folder", title === "bowl", title);
   await accessible("with photos");
   await picture("understood");
+
+  // Photos without cameras: they are looked for, and the engine's refusal is told.
+  const shared = await evaluate("location.hash"), bare = join(folder, "bare");
+  cpSync(join(bowl, "train"), bare, { recursive: true });
+  const dropped = async (file) => {
+    for (const type of ["dragEnter", "dragOver", "drop"]) await send("Input.dispatchDragEvent", { type, x, y, data: { items: [], files: [file], dragOperationsMask: 1 } });
+  };
+  check("what finds cameras is said", await evaluate("document.getElementById('finder').textContent.includes('pycolmap 0.0-test')"), await evaluate("document.getElementById('finder').textContent"));
+  await dropped(bare);
+  await until("document.getElementById('cameras-dialog').open");
+  await accessible("photos without cameras");
+  await picture("cameras");
+  await click("#cameras-close");
+  await until("!document.getElementById('cameras-dialog').open");
+  check("nothing is sent without a yes", await evaluate("location.hash") === shared, shared);
+  await dropped(bare);
+  await until("document.getElementById('cameras-dialog').open");
+  await click("#cameras-form button.main");
+  await until("document.getElementById('status').textContent.startsWith('Finding the cameras')", 30);
+  const searching = await evaluate("document.getElementById('status').textContent");
+  check("progress of the search", !await evaluate("document.getElementById('progress').hidden || document.getElementById('cancel').hidden"), searching);
+  await state("failed", 60);
+  const refusal = await evaluate("document.getElementById('status').textContent");
+  check("a refusal of the engine", refusal.includes("only 0 of 4 photos could be placed") && !refusal.includes("--"), refusal);
+  await evaluate(`location.hash = ${JSON.stringify(shared)}`);
+  await state("ready", 30);
 
   // A mask is edited: by pointer, by keys.
   await click("#photos li:nth-child(2) button:not(.look)");

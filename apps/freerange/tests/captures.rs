@@ -151,23 +151,18 @@ fn ring(count: usize) -> Vec<View> {
         .collect()
 }
 
-/// Runs `poses` with an engine that finds these cameras, of photos in `folder`. `models`: photos in each; before a bar those that it finds
-/// under masks.
+/// A program that finds these cameras: it stands for a Python with pycolmap. `models`: photos in each; before a bar those that it finds under
+/// masks. `before` is run first.
 #[cfg(unix)]
-fn posed(folder: &Path, views: &[View], found: &[View], models: &str, more: &[&str]) -> (i32, String, Option<Value>) {
+fn engine(folder: &Path, found: &[View], models: &str, before: &str) -> PathBuf {
     use std::os::unix::fs::PermissionsExt;
-    let (photos, model, out) = (folder.join("photos"), folder.join("model"), folder.join("out"));
-    for path in [&photos, &model, &out] {
-        drop(fs::remove_dir_all(path));
-    }
-    fs::create_dir_all(&photos).unwrap();
-    views.iter().for_each(|v| v.image.save(photos.join(format!("{}.png", v.name))).unwrap());
+    let (model, engine) = (folder.join("model"), folder.join("python"));
+    drop(fs::remove_dir_all(&model));
     let point = [(DVec3::ZERO, [0; 3])];
     freerange_scene::write_colmap(&model, found, DVec3::ZERO, &point).unwrap();
-    let engine = folder.join("python");
     let (masked, models) = models.split_once('|').unwrap_or((models, models));
     let script = format!(
-        "#!/bin/sh\nif [ \"$1\" = -c ]; then echo 0.0-test; exit 0; fi\nwork=$(dirname \"$2\")\nm='{models}'\n\
+        "#!/bin/sh\nif [ \"$1\" = -c ]; then echo 0.0-test; exit 0; fi\n{before}\nwork=$(dirname \"$2\")\nm='{models}'\n\
          grep -q '\"masks\": null' \"$2\" || m='{masked}'\nmkdir -p \"$work/model\"\n\
          cp {}/sparse/0/*.bin \"$work/model/\"\necho '{{\"engine\": \"test\", \"models\": '\"$m\"', \"pairs\": \"neighbors\", \"points\": 1}}' \
          > \"$work/result.json\"\n",
@@ -175,6 +170,19 @@ fn posed(folder: &Path, views: &[View], found: &[View], models: &str, more: &[&s
     );
     fs::write(&engine, script).unwrap();
     fs::set_permissions(&engine, fs::Permissions::from_mode(0o755)).unwrap();
+    engine
+}
+
+/// Runs `poses` with [`engine`] on photos in `folder`.
+#[cfg(unix)]
+fn posed(folder: &Path, views: &[View], found: &[View], models: &str, more: &[&str]) -> (i32, String, Option<Value>) {
+    let (photos, out) = (folder.join("photos"), folder.join("out"));
+    for path in [&photos, &out] {
+        drop(fs::remove_dir_all(path));
+    }
+    fs::create_dir_all(&photos).unwrap();
+    views.iter().for_each(|v| v.image.save(photos.join(format!("{}.png", v.name))).unwrap());
+    let engine = engine(folder, found, models, "");
     let text = |p: &Path| p.to_str().unwrap().to_owned();
     let (photos, out_text, engine) = (text(&photos), text(&out), text(&engine));
     let mut args = vec!["poses", &photos, "-o", &out_text, "--python", &engine];
@@ -279,4 +287,111 @@ fn poses_need_photos_and_an_engine() {
     assert!(text.contains("pip install pycolmap") && text.contains("apt install colmap"), "{text}");
     // `reconstruct` says what to do with photos alone.
     assert!(said(&["reconstruct", path, "-o", out]).contains("freerange poses"));
+}
+
+/// `freerange serve` with this engine; it ends with the test.
+#[cfg(unix)]
+struct Page(std::process::Child, String);
+
+#[cfg(unix)]
+impl Drop for Page {
+    fn drop(&mut self) {
+        self.0.kill().ok();
+        self.0.wait().ok();
+    }
+}
+
+#[cfg(unix)]
+impl Page {
+    fn start(more: &[&str], path: Option<&Path>) -> Self {
+        use std::io::BufRead;
+        let mut command = Command::new(env!("CARGO_BIN_EXE_freerange"));
+        command.args(["serve", "--port", "0", "--device", "cpu", "--no-token"]).args(more);
+        if let Some(path) = path {
+            command.env("PATH", path);
+        }
+        let mut child = command.stdout(std::process::Stdio::piped()).spawn().unwrap();
+        let mut line = String::new();
+        std::io::BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        Self(child, line.trim().trim_start_matches("http://").trim_end_matches('/').to_owned())
+    }
+
+    fn ask(&self, method: &str, path: &str, body: &[u8]) -> Value {
+        use std::io::{Read, Write};
+        let (address, kind) = (&self.1, "multipart/form-data; boundary=x");
+        let mut stream = std::net::TcpStream::connect(address).unwrap();
+        let length = body.len();
+        let head = format!(
+            "{method} {path} HTTP/1.1\r\nHost: {address}\r\nContent-Type: {kind}\r\nContent-Length: {length}\r\n\r\n"
+        );
+        stream.write_all(&[head.as_bytes(), body].concat()).unwrap();
+        let mut reply = Vec::new();
+        stream.read_to_end(&mut reply).unwrap();
+        let at = reply.windows(4).position(|w| w == b"\r\n\r\n").unwrap();
+        serde_json::from_slice(&reply[at + 4..]).unwrap()
+    }
+
+    /// Sends photos without cameras, and waits for what comes of them.
+    fn photos(&self, views: &[View], until: impl Fn(&Value) -> bool) -> Value {
+        let mut form =
+            b"--x\r\nContent-Disposition: form-data; name=\"scene\"\r\n\r\n{\"find_cameras\": true}\r\n".to_vec();
+        for view in views {
+            let name = &view.name;
+            let head =
+                format!("--x\r\nContent-Disposition: form-data; name=\"f\"; filename=\"ball/{name}.png\"\r\n\r\n");
+            let mut png = std::io::Cursor::new(Vec::new());
+            view.image.write_to(&mut png, image::ImageFormat::Png).unwrap();
+            form.extend([head.as_bytes(), &png.into_inner(), b"\r\n"].concat());
+        }
+        form.extend(b"--x--\r\n");
+        let id = self.ask("POST", "/jobs", &form)["id"].as_str().unwrap().to_owned();
+        for _ in 0..2400 {
+            let job = self.ask("GET", &format!("/jobs/{id}"), b"");
+            if until(&job) {
+                return job;
+            }
+            std::thread::sleep(std::time::Duration::from_millis(50));
+        }
+        panic!("it never came");
+    }
+}
+
+#[cfg(unix)]
+#[test]
+fn the_page_finds_cameras_by_the_same_engine() {
+    let folder = tempfile::tempdir().unwrap();
+    let views = ring(16);
+    let read = |job: &Value| job["state"] != "reading";
+    // Found, with a warning of the judge; the engine is ended when it takes too long, or is not wanted any more.
+    let wait = folder.path().join("wait");
+    let slow = format!("echo '{{\"step\": \"features\", \"done\": 0}}'\n[ ! -e {0} ] || sleep 300", wait.display());
+    let program = engine(folder.path(), &views[..14], "[14, 2]", &slow);
+    let page = Page::start(&["--python", program.to_str().unwrap(), "--max-search-time", "600"], None);
+    assert_eq!(page.ask("GET", "/server", b"")["camera_finder"]["name"], "pycolmap 0.0-test");
+    let job = page.photos(&views, read);
+    assert_eq!(job["state"], "ready", "{job}");
+    assert_eq!(job["understood"]["notes"][0], "14 of 16 photos have cameras, found by test");
+    assert_eq!(job["understood"]["format"], "colmap");
+    let warnings = job["understood"]["warnings"].to_string();
+    assert!(warnings.contains("no pose was found for 14.png, 15.png"), "{warnings}");
+    fs::write(&wait, "").unwrap();
+    let job = page.photos(&views, |job| job["stage"] == "features");
+    assert_eq!((&job["done"], &job["total"]), (&0.into(), &6.into()));
+    let id = job["id"].as_str().unwrap();
+    assert_eq!(page.ask("POST", &format!("/jobs/{id}/cancel"), b"")["state"], "cancelled");
+    fs::remove_file(&wait).unwrap();
+    assert_eq!(page.photos(&views, read)["state"], "ready", "the engine of the job before has ended");
+    drop(page);
+    // Refused, without a word of the command line.
+    let program = engine(folder.path(), &views[..9], "[9]", "");
+    let page = Page::start(&["--python", program.to_str().unwrap()], None);
+    let job = page.photos(&views[..9], read);
+    let error = job["error"].as_str().unwrap();
+    assert!(error.contains("no cameras that can be relied on") && error.contains("not at even steps"), "{error}");
+    assert!(error.contains("16 photos or more") && !error.contains("--") && !error.contains("/upload"), "{error}");
+    drop(page);
+    // Nothing that finds cameras.
+    let page = Page::start(&[], Some(&folder.path().join("empty")));
+    let about = page.ask("GET", "/server", b"");
+    assert!(about["camera_finder"]["missing"].as_str().unwrap().contains("neither COLMAP nor pycolmap"), "{about}");
 }

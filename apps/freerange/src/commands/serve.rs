@@ -1,5 +1,7 @@
 //! `freerange serve`
 
+mod cameras;
+
 use std::{
     env::VarError,
     fs::File,
@@ -19,11 +21,13 @@ use freerange::{
 use freerange_scene::camera::image_ops::to_picture;
 use freerange_scene::estimate::LeaveOneOut;
 use freerange_serve::{
-    Engine, EngineError, Example, JobOptions, Limits, Outcome, Scene, ServeConfig, ServeError, Server, Step,
+    Engine, EngineError, Example, FoundCameras, JobOptions, Limits, Outcome, Scene, Search, SearchStep, ServeConfig,
+    ServeError, Server, Step,
 };
 use freerange_util::IoError;
 use image::RgbaImage;
 
+use self::cameras::Finder;
 use crate::{error::CliError, pipeline::PipelineArgs, ranks::Job, signals::Signals};
 
 /// Serve a web page: drop photos with cameras, correct masks, watch the Gaussians appear.
@@ -71,12 +75,21 @@ pub struct Args {
     /// Most seconds for reading the photos of a job.
     #[arg(long, value_name = "SECONDS", default_value_t = 300, value_parser = clap::value_parser!(u64).range(1..=604_800))]
     max_read_time: u64,
+    /// Most seconds for finding the cameras of a job's photos.
+    #[arg(long, value_name = "SECONDS", default_value_t = 1800, value_parser = clap::value_parser!(u64).range(1..=604_800))]
+    max_search_time: u64,
+    /// Most megabytes of memory for COLMAP or pycolmap; measured on Linux.
+    #[arg(long, value_name = "MB", default_value_t = 4096, value_parser = clap::value_parser!(u64).range(16..=1_048_576))]
+    max_search_memory: u64,
     /// Most megabytes of all jobs on disk.
     #[arg(long, value_name = "MB", default_value_t = 16_384, value_parser = clap::value_parser!(u64).range(16..=1_048_576_000))]
     max_disk: u64,
     /// Most open jobs: in preparation, waiting or computing.
     #[arg(long, value_name = "JOBS", default_value_t = 32, value_parser = clap::value_parser!(u16).range(1..=10_000))]
     max_jobs: u16,
+    /// Python with pycolmap, for photos without cameras [default: COLMAP on the PATH, else python3].
+    #[arg(long, value_name = "PROGRAM")]
+    python: Option<PathBuf>,
     #[command(flatten)]
     pipeline: PipelineArgs,
 }
@@ -109,6 +122,8 @@ pub fn run(args: &Args) -> Result<(), CliError> {
             open_jobs: args.max_jobs.into(),
             memory: args.max_memory << 20,
             read_time: Duration::from_secs(args.max_read_time),
+            search_time: Duration::from_secs(args.max_search_time),
+            search_memory: args.max_search_memory << 20,
             disk: args.max_disk << 20,
             ..Limits::default()
         },
@@ -120,6 +135,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     unsafe {
         libc::signal(libc::SIGPIPE, libc::SIG_IGN);
     }
+    let finder = Finder::new(args.python.as_deref())?;
     let device = Job::alone().open(args.pipeline.device)?;
     let model = args.pipeline.open(&device)?;
     if let Some(file) = args.pipeline.init_file() {
@@ -132,7 +148,8 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         Some(path) => path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned(),
         None => "the shipped model".into(),
     };
-    let engine = Local { model, pipeline: args.pipeline.clone(), name: format!("{place} on {}", args.pipeline.device) };
+    let name = format!("{place} on {}", args.pipeline.device);
+    let engine = Local { model, pipeline: args.pipeline.clone(), name, finder };
     let server = Server::bind(&config, Arc::new(engine))?;
     let stopper = server.stopper();
     signals.on_first(move || stopper.stop())?;
@@ -215,6 +232,7 @@ struct Local {
     model: Reconstructor,
     pipeline: PipelineArgs,
     name: String,
+    finder: Arc<Finder>,
 }
 
 fn engine_error(e: freerange::Error) -> EngineError {
@@ -292,5 +310,17 @@ impl Engine for Local {
     fn picture(&self, cloud: &Gaussians, camera: &Camera) -> Result<RgbaImage, String> {
         let rgb = render_view(cloud, camera).map_err(|e| e.to_string())?;
         Ok(to_picture(&rgb, camera.width, camera.height))
+    }
+
+    fn camera_finder(&self) -> Result<String, String> {
+        self.finder.name()
+    }
+
+    fn find_cameras(
+        &self,
+        search: &Search<'_>,
+        tell: &mut dyn FnMut(&SearchStep),
+    ) -> Result<FoundCameras, EngineError> {
+        self.finder.find(search, tell)
     }
 }

@@ -5,6 +5,7 @@ mod bin;
 mod orders;
 mod read;
 mod results;
+mod search;
 mod shown;
 mod table;
 mod work;
@@ -143,6 +144,10 @@ impl Board {
 
     pub fn engine_name(&self) -> String {
         self.engine.name()
+    }
+
+    pub fn camera_finder(&self) -> Result<String, String> {
+        self.engine.camera_finder()
     }
 
     pub fn limits(&self) -> &Limits {

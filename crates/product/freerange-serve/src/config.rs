@@ -62,6 +62,10 @@ pub struct Limits {
     pub finished_jobs: usize,
     /// A job whose photos are read for longer is ended.
     pub read_time: Duration,
+    /// A search for the cameras of photos that takes longer is ended.
+    pub search_time: Duration,
+    /// Bytes of memory that a program may take which searches for cameras; beyond, it is ended.
+    pub search_memory: u64,
     /// A job that computes longer is ended.
     pub job_time: Duration,
     /// A job that waits longer for someone to press go makes way where there is no room for new ones.
@@ -91,6 +95,8 @@ impl Default for Limits {
             readers: 2,
             disk: 16 << 30,
             read_time: Duration::from_secs(300),
+            search_time: Duration::from_secs(1800),
+            search_memory: 4 << 30,
             open_jobs: 32,
             finished_jobs: 200,
             job_time: Duration::from_secs(900),

@@ -1,10 +1,11 @@
 //! What the page asks of the program behind it.
 
-use std::ops::ControlFlow;
+use std::{ops::ControlFlow, path::Path};
 
 use freerange_gaussians::Gaussians;
 use freerange_scene::camera::{Camera, FrameConfig, View};
 use freerange_scene::estimate::LeaveOneOut;
+use freerange_util::Stop;
 use image::RgbaImage;
 use serde::{Deserialize, Serialize};
 
@@ -38,6 +39,57 @@ pub trait Engine: Send + Sync + 'static {
     /// # Errors
     /// A sentence for the log.
     fn picture(&self, cloud: &Gaussians, camera: &Camera) -> Result<RgbaImage, String>;
+
+    /// The program that finds the cameras of photos that have none, for people.
+    ///
+    /// # Errors
+    /// Where there is none: why, in a sentence for the user.
+    fn camera_finder(&self) -> Result<String, String>;
+
+    /// Finds the cameras of photos, and writes a scene with them into `search.scene`. `tell` hears of every step.
+    ///
+    /// # Errors
+    /// Says whose fault it is: doubtful cameras are the input's. [`EngineError::Cancelled`] where `search.stop` says so.
+    fn find_cameras(&self, search: &Search<'_>, tell: &mut dyn FnMut(&SearchStep))
+    -> Result<FoundCameras, EngineError>;
+}
+
+/// Photos without cameras.
+pub struct Search<'a> {
+    /// The folder of the photos, or one with `images` and perhaps `masks` in it.
+    pub photos: &'a Path,
+    /// Where the scene goes: there is nothing yet.
+    pub scene: &'a Path,
+    /// Where temporary files go: there is nothing yet.
+    pub work: &'a Path,
+    /// The photos are not at even steps of one turn.
+    pub uneven: bool,
+    /// When to end early.
+    pub stop: &'a Stop,
+    /// Most bytes of memory of a program that is run.
+    pub memory: u64,
+    /// Most bytes of memory of the photos that are looked at.
+    pub photos_memory: u64,
+}
+
+/// How far a search has come.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SearchStep {
+    /// One word: `features`, `matches`, `model` or `checks`.
+    pub stage: &'static str,
+    /// Steps that are done.
+    pub done: usize,
+    /// All steps.
+    pub total: usize,
+}
+
+/// What came of a search.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct FoundCameras {
+    /// What was done, in a sentence.
+    pub notes: Vec<String>,
+    /// What may be wrong.
+    pub warnings: Vec<String>,
 }
 
 /// What is reconstructed from.

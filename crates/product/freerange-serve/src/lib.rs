@@ -30,7 +30,9 @@ mod splats;
 mod upload;
 
 pub use config::{Example, Limits, ServeConfig};
-pub use engine::{Engine, EngineError, Init, JobOptions, Outcome, Quality, Scene, Step, Symmetry};
+pub use engine::{
+    Engine, EngineError, FoundCameras, Init, JobOptions, Outcome, Quality, Scene, Search, SearchStep, Step, Symmetry,
+};
 pub use error::{Refusal, ServeError};
 pub use guard::draw_token;
 pub use server::{Server, Stopper};

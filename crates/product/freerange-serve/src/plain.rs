@@ -3,7 +3,7 @@
 use std::path::Path;
 
 /// What other crates advise, and what the page says instead.
-const WORDS: [(&str, &str); 21] = [
+const WORDS: [(&str, &str); 23] = [
     ("; --invert-masks if black is the object", "; tick \u{201c}In mask files black is the object\u{201d} if it is"),
     (" (--masks FOLDER if they do)", ""),
     (" (--masks alpha if it is)", " (choose \u{201c}alpha\u{201d} under Masks if it is)"),
@@ -14,6 +14,11 @@ const WORDS: [(&str, &str); 21] = [
     ),
     ("; --up says otherwise", "; choose another under Up if it is wrong"),
     (", or --center X,Y,Z, as", ", as"),
+    (
+        "(--uneven if photos are missing there, or not in order)",
+        "(tick \u{201c}not at even steps\u{201d} if photos are missing there, or not in order)",
+    ),
+    ("(--uneven if they did)", "(tick \u{201c}not at even steps\u{201d} if they did)"),
     ("; if the poses are right, say where the object is (--center X,Y,Z)", ""),
     ("; say where the object is (--center X,Y,Z)", ""),
     ("; on a turntable in even steps: --turntable ELEVATION,FOV", "; on a turntable in even steps: fill in Turntable"),
@@ -109,6 +114,9 @@ mod tests {
         }
         let mut found = Vec::new();
         sources(Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../capture/freerange-scene/src")), &mut found);
+        // What is said of cameras that were found.
+        let judge = "/../../../apps/freerange/src/commands/poses/judge.rs";
+        found.push(std::fs::read_to_string([env!("CARGO_MANIFEST_DIR"), judge].concat()).unwrap());
         let with: Vec<String> = found.iter().flat_map(|s| literals(s)).filter(|l| l.contains("--")).collect();
         assert!(with.len() >= 15, "{with:?}");
         for literal in with {

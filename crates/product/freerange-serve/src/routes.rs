@@ -209,10 +209,15 @@ fn server(site: &Site) -> Response {
         "version": env!("CARGO_PKG_VERSION"),
         "engine": site.board.engine_name(),
         "example": site.example.map(|e| e.name),
+        "camera_finder": match site.board.camera_finder() {
+            Ok(name) => json!({ "name": name }),
+            Err(missing) => json!({ "missing": missing }),
+        },
         "limits": {
             "bytes": limits.bytes, "file_bytes": limits.file_bytes, "files": limits.files, "pixels": limits.pixels,
             "job_pixels": limits.job_pixels, "side": limits.side, "memory": limits.memory, "disk": limits.disk,
-            "read_seconds": limits.read_time.as_secs(), "job_seconds": limits.job_time.as_secs(),
+            "read_seconds": limits.read_time.as_secs(), "search_seconds": limits.search_time.as_secs(),
+            "job_seconds": limits.job_time.as_secs(),
         },
     }))
 }
@@ -286,6 +291,9 @@ fn post(site: &Site, request: &mut Request) -> Answer {
         (Some(_), _) => return Err(Refusal::new(404, "there is no such example")),
     }
     let splats = upload.only_splats()?;
+    if scene.find_cameras && splats.is_none() {
+        board.camera_finder().map_err(|missing| Refusal::new(422, missing))?;
+    }
     if splats.is_some() && options.is_some() {
         return Err(Refusal::new(422, "field `go`: expected photos; a file of Gaussians is shown, not computed"));
     }

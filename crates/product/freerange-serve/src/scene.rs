@@ -34,6 +34,10 @@ pub struct SceneOptions {
     pub cameras: Option<String>,
     /// `ELEVATION,FOV` of photos of one even turn, which have no cameras.
     pub turntable: Option<String>,
+    /// The photos have no cameras: the engine finds them.
+    pub find_cameras: bool,
+    /// Photos whose cameras are to be found are not at even steps of one turn.
+    pub uneven: bool,
 }
 
 impl SceneOptions {
@@ -71,7 +75,11 @@ impl SceneOptions {
 
     /// Refuses what cannot be used.
     pub fn check(&self) -> Result<(), Refusal> {
-        self.masks().and(self.up()).and(self.cameras()).and(self.turntable()).map(drop)
+        let turntable = self.masks().and(self.up()).and(self.cameras()).and(self.turntable())?;
+        match turntable.is_some() && self.find_cameras {
+            true => Err(Refusal::new(422, "find_cameras: expected photos without a turntable, found one")),
+            false => Ok(()),
+        }
     }
 }
 
@@ -125,7 +133,7 @@ fn save(picture: &RgbaImage, path: &Path) -> Result<(), Refusal> {
 
 /// Photos of a client, and what is made of them.
 pub struct Preparation<'a> {
-    /// Where the client's files are.
+    /// Where the client's files are, or the scene that was made of them.
     pub upload: &'a Path,
     /// Where what is needed of them goes.
     pub folder: &'a Path,
@@ -243,8 +251,8 @@ pub fn prepare(job: &Preparation<'_>) -> Result<Value, Refusal> {
     Ok(understood)
 }
 
-/// The folder in `upload` that holds the scene: folders that hold one folder and nothing else are passed through.
-fn root(upload: &Path) -> std::io::Result<PathBuf> {
+/// The folder in `upload` that holds the scene or the photos: folders that hold one folder and nothing else are passed through.
+pub fn root(upload: &Path) -> std::io::Result<PathBuf> {
     let mut at = upload.to_path_buf();
     loop {
         let inside: Vec<_> = fs::read_dir(&at)?.collect::<Result<_, _>>()?;

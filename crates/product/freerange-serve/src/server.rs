@@ -148,14 +148,15 @@ impl Server {
     pub fn run(self) -> std::io::Result<()> {
         let board = &self.site.board;
         let named = |name: &str| thread::Builder::new().name(name.into());
-        let (computes, empties) = (board.clone(), board.clone());
+        let (computes, empties, searches) = (board.clone(), board.clone(), board.clone());
         let mut workers = vec![
             named("jobs").spawn(move || computes.compute_all())?,
             named("bin").spawn(move || empties.empty_all())?,
+            named("cameras").spawn(move || searches.read_all(true))?,
         ];
         for _ in 0..board.limits().readers.max(1) {
             let reads = board.clone();
-            workers.push(named("photos").spawn(move || reads.read_all())?);
+            workers.push(named("photos").spawn(move || reads.read_all(false))?);
         }
         for stream in self.listener.incoming() {
             if self.ended.load(Relaxed) {

@@ -6,13 +6,17 @@ use std::{
     process::{Command, Stdio},
 };
 
-use super::job::{Done, Job, failed};
-use crate::{error::CliError, progress::Progress};
+use super::{
+    bounds::Bounds,
+    job::{Done, Job, failed},
+};
+use crate::error::CliError;
 
 /// One of COLMAP's programs, the options that it knows, and those that were passed over.
 struct Program<'a> {
     file: &'a Path,
     log: &'a Path,
+    bounds: &'a Bounds,
     passed_over: Vec<String>,
 }
 
@@ -33,8 +37,8 @@ impl Program<'_> {
         }
         let log =
             || OpenOptions::new().create(true).append(true).open(self.log).map_err(|e| CliError::file(self.log, e));
-        let status = run.stdin(Stdio::null()).stdout(log()?).stderr(log()?).status();
-        match status.map_err(|e| CliError::file(self.file, e))?.success() {
+        run.stdin(Stdio::null()).stdout(log()?).stderr(log()?);
+        match self.bounds.run(&mut run, &mut |_| {})?.success() {
             true => Ok(()),
             false => Err(failed(&format!("colmap {command}"), self.log)),
         }
@@ -42,16 +46,21 @@ impl Program<'_> {
 }
 
 /// As the script for pycolmap.
-pub fn run(file: &Path, version: &str, job: &Job, log: &Path) -> Result<Done, CliError> {
+pub fn run(
+    (file, version): (&Path, &str),
+    job: &Job,
+    log: &Path,
+    bounds: &Bounds,
+    tell: &mut dyn FnMut(&'static str, &str, u64),
+) -> Result<Done, CliError> {
     File::create(log).map_err(|e| CliError::file(log, e))?;
-    let mut colmap = Program { file, log, passed_over: Vec::new() };
+    let mut colmap = Program { file, log, bounds, passed_over: Vec::new() };
     let path = |p: &Path| p.to_string_lossy().into_owned();
     let flag = |on: bool| u8::from(on).to_string();
     let (database, images) =
         (("database_path", path(&job.work.join("database.db"))), ("image_path", path(&job.images)));
-    let mut bar = Progress::new("poses", 5);
     for (i, names) in job.groups.iter().enumerate() {
-        bar.at(1, "features");
+        tell("features", "", 0);
         let list = job.work.join(format!("photos-{i}.txt"));
         std::fs::write(&list, names.join("\n")).map_err(|e| CliError::file(&list, e))?;
         let mut options = vec![
@@ -66,6 +75,8 @@ pub fn run(file: &Path, version: &str, job: &Job, log: &Path) -> Result<Done, Cl
             ("SiftExtraction.estimate_affine_shape", flag(job.thorough)),
             ("SiftExtraction.domain_size_pooling", flag(job.thorough)),
         ];
+        let threads = "FeatureExtraction.num_threads|SiftExtraction.num_threads";
+        options.extend(job.threads.map(|n| (threads, n.to_string())));
         options.extend(job.masks.as_deref().map(|masks| ("ImageReader.mask_path", path(masks))));
         colmap.run("feature_extractor", &options)?;
     }
@@ -78,13 +89,13 @@ pub fn run(file: &Path, version: &str, job: &Job, log: &Path) -> Result<Done, Cl
     let mut done = Done { engine: format!("COLMAP {version}"), ..Done::default() };
     let stages = if job.all_pairs { &["neighbors", "all"][..] } else { &["neighbors"][..] };
     for (i, stage) in stages.iter().copied().enumerate() {
-        bar.at(2 + 2 * i as u64, &format!("matches {stage}"));
+        tell("matches", stage, 1 + 2 * i as u64);
         let mut options = matching.to_vec();
         if stage == "neighbors" {
             options.extend([("match_list_path", path(&job.pairs)), ("match_type", "pairs".into())]);
         }
         colmap.run(if stage == "neighbors" { "matches_importer" } else { "exhaustive_matcher" }, &options)?;
-        bar.at(3 + 2 * i as u64, &format!("model {stage}"));
+        tell("model", stage, 2 + 2 * i as u64);
         let out = job.work.join(format!("models-{stage}"));
         std::fs::create_dir_all(&out).map_err(|e| CliError::file(&out, e))?;
         colmap.run("mapper", &mapper(&database.1, &images.1, &path(&out), job.seed))?;
@@ -106,7 +117,6 @@ pub fn run(file: &Path, version: &str, job: &Job, log: &Path) -> Result<Done, Cl
             }
         }
     }
-    bar.finish();
     if !colmap.passed_over.is_empty() {
         eprintln!("note: COLMAP {version} has no option {}", colmap.passed_over.join(", "));
     }

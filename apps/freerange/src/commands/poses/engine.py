@@ -1,7 +1,7 @@
 """Poses of photos by pycolmap, run by `freerange poses` in a Python that has it.
 
 usage: engine.py JOB.json
-JOB: work, images (folders), names, groups (lists of names that share a camera), pairs (a file), thorough, all_pairs, masks (a folder or null), seed.
+JOB: work, images (folders), names, groups (lists of names that share a camera), pairs (a file), thorough, all_pairs, threads (a number or null), masks (a folder or null), seed.
 Prints a line of JSON for each step that begins; the model comes into work/model, what was done into work/result.json.
 """
 import json
@@ -30,6 +30,8 @@ def main():
     extraction.sift.peak_threshold = job["peak_threshold"]
     extraction.sift.estimate_affine_shape = job["thorough"]
     extraction.sift.domain_size_pooling = job["thorough"]
+    if job["threads"]:
+        extraction.num_threads = job["threads"]
     for i, names in enumerate(job["groups"]):
         say(step="features", done=i, total=len(job["groups"]))
         pycolmap.extract_features(

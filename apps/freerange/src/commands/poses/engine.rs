@@ -2,13 +2,15 @@
 
 use std::{
     fs::File,
-    io::{BufRead, BufReader},
     path::{Path, PathBuf},
     process::{Command, Stdio},
 };
 
-use super::job::{Done, Job, failed};
-use crate::{error::CliError, progress::Progress};
+use super::{
+    bounds::Bounds,
+    job::{Done, Job, failed},
+};
+use crate::error::CliError;
 
 /// The script for pycolmap.
 const SCRIPT: &str = include_str!("engine.py");
@@ -50,11 +52,18 @@ impl Engine {
         }
     }
 
-    /// Finds poses: the model comes into `model` of the job's folder.
-    pub fn run(&self, job: &Job, log: &Path) -> Result<Done, CliError> {
+    /// Finds poses: the model comes into `model` of the job's folder. `tell` hears of each step that begins: a word, which pairs, how many are
+    /// done.
+    pub fn run(
+        &self,
+        job: &Job,
+        log: &Path,
+        bounds: &Bounds,
+        tell: &mut dyn FnMut(&'static str, &str, u64),
+    ) -> Result<Done, CliError> {
         match self {
-            Self::Pycolmap(python, _) => run_pycolmap(python, job, log),
-            Self::Colmap(program, version) => super::colmap::run(program, version, job, log),
+            Self::Pycolmap(python, _) => run_pycolmap(python, job, log, bounds, tell),
+            Self::Colmap(program, version) => super::colmap::run((program, version), job, log, bounds, tell),
         }
     }
 }
@@ -77,7 +86,13 @@ fn colmap(program: &Path) -> Option<Engine> {
     Some(Engine::Colmap(program.into(), version.to_owned()))
 }
 
-fn run_pycolmap(python: &Path, job: &Job, log: &Path) -> Result<Done, CliError> {
+fn run_pycolmap(
+    python: &Path,
+    job: &Job,
+    log: &Path,
+    bounds: &Bounds,
+    tell: &mut dyn FnMut(&'static str, &str, u64),
+) -> Result<Done, CliError> {
     let write = |name: &str, bytes: &[u8]| {
         let path = job.work.join(name);
         std::fs::write(&path, bytes).map_err(|e| CliError::file(&path, e)).map(|()| path)
@@ -87,19 +102,13 @@ fn run_pycolmap(python: &Path, job: &Job, log: &Path) -> Result<Done, CliError> 
     let errors = File::create(log).map_err(|e| CliError::file(log, e))?;
     let mut command = Command::new(python);
     command.arg(script).arg(asked).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(errors);
-    let mut child = command.spawn().map_err(|e| CliError::file(python, e))?;
-    let out = child.stdout.take().ok_or_else(|| CliError::failure("a process without output"))?;
-    // Features, then matches and a model of neighbors, then of all pairs if it comes to that.
-    let mut bar = Progress::new("poses", 5);
-    let mut step = 0;
-    for line in BufReader::new(out).lines().map_while(Result::ok) {
-        let Ok(told) = serde_json::from_str::<serde_json::Value>(&line) else { continue };
-        let (what, pairs) = (told["step"].as_str().unwrap_or(""), told["pairs"].as_str().unwrap_or(""));
-        step += u64::from(told["done"].as_u64().unwrap_or(0) == 0);
-        bar.at(step, &format!("{what} {pairs}"));
-    }
-    bar.finish();
-    let status = child.wait().map_err(|e| CliError::file(python, e))?;
+    let mut begun = 0;
+    let status = bounds.run(&mut command, &mut |line| {
+        let Ok(told) = serde_json::from_str::<serde_json::Value>(line) else { return };
+        let what = ["features", "matches", "model"].into_iter().find(|what| told["step"] == *what);
+        begun += u64::from(told["done"].as_u64().unwrap_or(0) == 0);
+        tell(what.unwrap_or("model"), told["pairs"].as_str().unwrap_or(""), u64::saturating_sub(begun, 1));
+    })?;
     if !status.success() {
         return Err(failed("pycolmap", log));
     }

@@ -25,6 +25,8 @@ pub struct Job {
     pub all_pairs: bool,
     /// Contrast that a feature needs at least.
     pub peak_threshold: f64,
+    /// Threads that look for features; none: as many as the engine likes.
+    pub threads: Option<usize>,
     /// A folder of masks as COLMAP has them.
     pub masks: Option<PathBuf>,
     /// Of all random numbers.

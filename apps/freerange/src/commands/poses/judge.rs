@@ -8,11 +8,10 @@ use freerange_scene::{
     inspect::view_warnings,
     read::{Cameras, Intrinsics},
 };
-use freerange_util::Stop;
 use glam::{DMat3, DVec3};
 use serde::Serialize;
 
-use super::job::Done;
+use super::{bounds::Bounds, job::Done};
 use crate::error::CliError;
 
 /// Share of the photos that must have a pose, and their least number.
@@ -188,9 +187,10 @@ impl Judgement {
     }
 
     /// Looks at the photos themselves: whether masks and table are consistent, as `inspect` does, and how well the others predict each.
-    pub fn look_at_photos(&mut self, cameras: &Cameras) -> Result<(), CliError> {
+    pub fn look_at_photos(&mut self, cameras: &Cameras, bounds: &Bounds) -> Result<(), CliError> {
         // As `reconstruct` reads them, but small, and masks are not corrected by other views: that would hide wrong poses.
-        let photos = LoadConfig { max_side: 640, ..LoadConfig::default() };
+        let photos = LoadConfig { max_side: 640, stop: bounds.stop.clone(), ..LoadConfig::default() };
+        let photos = LoadConfig { memory: bounds.photos_memory.unwrap_or(photos.memory), ..photos };
         let config = SceneConfig { photos, ..SceneConfig::default() };
         let Scene { loaded, frame, .. } = match Scene::load(cameras.clone(), &config) {
             Ok(scene) => scene,
@@ -207,12 +207,12 @@ impl Judgement {
             }
             Err(e) => self.refused.push(e.to_string()),
         }
-        self.predict(&loaded);
+        self.predict(&loaded, bounds);
         Ok(())
     }
 
-    fn predict(&mut self, loaded: &Loaded) {
-        let shown = match leave_one_out(&loaded.views, &Stop::default()) {
+    fn predict(&mut self, loaded: &Loaded, bounds: &Bounds) {
+        let shown = match leave_one_out(&loaded.views, &bounds.stop) {
             Ok(shown) => shown,
             Err(e) => {
                 self.refused.push(format!("these poses give no render of the object ({e})"));

@@ -11,11 +11,13 @@ use rayon::ThreadPoolBuilder;
 use serde_json::Value;
 
 use super::{
-    Board, clear, uploads,
+    Board, clear,
+    table::{Job, Progress},
+    uploads,
     work::{guarded, on_white, save_thumbnail},
 };
 use crate::{
-    Refusal,
+    FoundCameras, Refusal,
     disk::size_of,
     record::{SampleRecord, State},
     scene::{self, Preparation, SceneOptions},
@@ -39,14 +41,16 @@ struct Unread {
 }
 
 impl Board {
-    /// The next job whose photos nobody reads yet; none when the server ends.
-    fn next_unread(&self) -> Option<Unread> {
+    /// The next job whose photos nobody reads yet, of those whose cameras are to be found or of the others; none when the server ends.
+    fn next_unread(&self, searching: bool) -> Option<Unread> {
         let mut table = self.table();
         loop {
             if self.stopping.load(Relaxed) {
                 return None;
             }
-            let of = table.jobs.values_mut().filter(|j| j.record.state == State::Reading && !j.read_by_one);
+            let searches = |j: &Job| j.record.scene.find_cameras && j.splats.is_none();
+            let unread = |j: &&mut Job| j.record.state == State::Reading && !j.read_by_one && searches(j) == searching;
+            let of = table.jobs.values_mut().filter(unread);
             if let Some(job) = of.min_by_key(|j| (j.record.turn, j.record.created)) {
                 job.read_by_one = true;
                 return Some(Unread {
@@ -61,8 +65,9 @@ impl Board {
         }
     }
 
-    /// Reads photos, one job after the other, until the server ends. Several threads do so at the same time.
-    pub fn read_all(&self) {
+    /// Reads photos, one job after the other, until the server ends. Several threads do so at the same time. One thread of its own has the jobs
+    /// whose cameras are to be found (`searching`): that takes minutes, and nobody else waits for it.
+    pub fn read_all(&self, searching: bool) {
         // Threads of its own: in a common pool, pictures of a small job would wait behind all those of a large one.
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let own = ThreadPoolBuilder::new().num_threads(cores.div_ceil(self.limits.readers.max(1))).build();
@@ -70,13 +75,13 @@ impl Board {
             Ok(pool) => pool,
             Err(e) => return tracing::error!("no threads to read photos: {e}"),
         };
-        while let Some(unread) = self.next_unread() {
+        while let Some(unread) = self.next_unread(searching) {
             let read = pool.install(|| guarded(|| self.read(&unread)));
             let Unread { id, folder, cancel, .. } = unread;
             clear(&uploads(&folder));
             let bytes = size_of(&folder);
             let told = self.change(&id, |job| {
-                (job.read_by_one, job.bytes) = (false, bytes);
+                (job.read_by_one, job.bytes, job.progress) = (false, bytes, Progress::default());
                 if cancel.load(Relaxed) || job.record.state != State::Reading {
                     // Someone was faster; what was read is there all the same.
                     if let Ok(Read { understood, .. }) = read {
@@ -119,9 +124,13 @@ impl Board {
             save_thumbnail(folder, &splats::thumbnail(&*self.engine, &found))?;
             return Ok(Read { understood: found.understood, result: Some((found.gaussians, found.up)) });
         }
+        let mut upload = uploads(folder).join("0/0/0");
+        let mut found = FoundCameras::default();
+        if options.find_cameras {
+            (found, upload) = self.search(id, folder, options, cancel)?;
+        }
         let stop = Stop::on(cancel.clone(), Some(Instant::now() + self.limits.read_time));
-        let upload = uploads(folder).join("0/0/0");
-        let understood = scene::prepare(&Preparation {
+        let mut understood = scene::prepare(&Preparation {
             upload: &upload,
             folder,
             options,
@@ -130,6 +139,11 @@ impl Board {
             stop: &stop,
             room: self.room(id),
         })?;
+        for (list, more) in [("warnings", found.warnings), ("notes", found.notes)] {
+            if let Some(list) = understood[list].as_array_mut() {
+                list.splice(0..0, more.into_iter().map(Value::from));
+            }
+        }
         let first = image::open(scene::view_file(folder, 0)).map_err(Refusal::own)?.into_rgba8();
         save_thumbnail(folder, &on_white(&first))?;
         Ok(Read { understood, result: None })

@@ -109,7 +109,7 @@ impl Job {
     /// What changes while it is on its way.
     pub(super) fn status(&self, waiting: &[u64]) -> Value {
         let (r, p) = (&self.record, &self.progress);
-        let running = r.state == State::Running;
+        let running = matches!(r.state, State::Running | State::Reading);
         let estimate = self.estimates.back().map(|e| {
             let parts: Vec<_> =
                 e.parts.iter().map(|(s, rows)| json!({ "sample": s, "gaussians": rows.len() / ROW })).collect();

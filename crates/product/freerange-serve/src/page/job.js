@@ -16,10 +16,12 @@ export const hooks = { edited: async () => {} };
 
 const WORDS = { canonicalize: "finding the object", symmetry: "looking for symmetry", propose: "proposing", refine: "refining with the network", optimize: "optimizing on the photos" };
 
+const SEARCH = { features: "features of the photos", matches: "matches between photos", model: "poses", checks: "checks of the poses" };
+
 /** @param {Status} s */
 const sentence = (s) => {
   switch (s.state) {
-    case "reading": return "The files are read.";
+    case "reading": return s.stage ? `Finding the cameras, step ${s.done + 1} of ${s.total}: ${SEARCH[/** @type {keyof typeof SEARCH} */ (s.stage)] ?? s.stage}. This takes minutes.` : "The files are read.";
     case "ready": return "Ready. Look at the masks, then press Go.";
     case "queued": return s.position ? `Waiting: ${s.position} before this one.` : "Waiting.";
     case "running": return s.stage ? `${WORDS[/** @type {keyof typeof WORDS} */ (s.stage)] ?? s.stage}: step ${s.done} of ${s.total}${left(s)}` : "Starting.";
@@ -56,7 +58,7 @@ export const showStatus = (s) => {
   said = key;
   box("status").textContent = text;
   const bar = get("progress", HTMLProgressElement);
-  bar.hidden = s.state !== "running";
+  bar.hidden = s.state !== "running" && !(s.state === "reading" && s.stage);
   bar.value = s.total ? s.done / s.total : 0;
   button("cancel").hidden = !["reading", "queued", "running"].includes(s.state);
   button("remove").hidden = button("rename").hidden = ["reading", "running"].includes(s.state);

@@ -11,6 +11,7 @@ if (location.search) history.replaceState(null, "", `/${location.hash}`);
 void attempt(async () => {
   const about = await call("GET", "/server");
   app.limits = about.limits;
+  app.finder = about.camera_finder;
   tellLimits();
   if (about.example) offerExample(about.example);
   await open();

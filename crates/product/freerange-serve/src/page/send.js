@@ -11,6 +11,8 @@ const PHOTO = /\.(png|jpe?g|webp)$/i;
 const SPLATS = /\.(ply|splat|spz|sog|glb|usd[az])$/i;
 /** Photos that nobody here can read. */
 const OTHERS = /\.(heic|heif|avif|tiff?|dng|raw|cr[23]|nef|arw|exr|mp4|mov)$/i;
+/** What has cameras, by its name. */
+const CAMERAS = /\.(json|bin|xml|csv)$|(^|\/)(cameras|images)\.txt$/i;
 /** What lies in captures and is not read: smaller copies, points, a data base. */
 const UNREAD = /(^|\/)(images_[248]\/|points3D\.(bin|txt)$)/;
 
@@ -23,6 +25,8 @@ export const tellLimits = () => {
   if (!limits) return;
   box("limits").textContent = `At most ${limits.files.toLocaleString("en")} files, ${megabytes(limits.bytes)} together, `
     + `${Math.round(limits.pixels / 1e6)} megapixels a photo. Photos are used at ${limits.side} pixels at most.`;
+  const { name, missing } = app.finder;
+  box("finder").textContent = name ? `Photos without cameras: ${name} finds the cameras, which takes minutes.` : `Photos need cameras; ${missing}.`;
 };
 
 /**
@@ -87,10 +91,40 @@ const upload = (form) => new Promise((done, fail) => {
 });
 button("stop-sending").addEventListener("click", () => sending?.abort());
 
-/** @param {FormData} form */
-const post = async (form) => {
+const asking = get("cameras-dialog", HTMLDialogElement);
+/** @type {(yes: boolean) => void} */
+let answered = () => {};
+get("cameras-form", HTMLFormElement).addEventListener("submit", (e) => {
+  e.preventDefault();
+  answered(true);
+  asking.close();
+});
+asking.addEventListener("close", () => answered(false));
+button("cameras-close").addEventListener("click", () => asking.close());
+
+/**
+ * What is asked of the server for photos that come without cameras; null: they are not to be sent.
+ * @param {Picked[]} fine
+ * @returns {Promise<?object>}
+ */
+const search = async (fine) => {
+  const photos = fine.filter(({ path }) => PHOTO.test(path) && !/(^|\/)masks\//.test(path));
+  if (!photos.length || fine.some(({ path }) => CAMERAS.test(path)) || input("scene-turntable").value.trim()) return {};
+  const what = photos.length === 1 ? "This photo has no camera" : `These ${photos.length} photos have no cameras`, { name, missing } = app.finder;
+  if (!name) throw new Error(`${what}, and ${missing}`);
+  box("cameras-text").textContent = `${what}. ${name} can look for them on this server, which takes minutes.`;
+  asking.showModal();
+  const yes = await new Promise((/** @type {(yes: boolean) => void} */ done) => { answered = done; });
+  return yes ? { find_cameras: true, uneven: input("uneven").checked } : null;
+};
+
+/**
+ * @param {FormData} form
+ * @param {object} [more] what else is said of the scene
+ */
+const post = async (form, more) => {
   const turntable = input("scene-turntable").value.trim();
-  const scene = { masks: select("scene-masks").value, up: select("scene-up").value, cameras: select("scene-cameras").value, invert_masks: input("scene-invert").checked, ...(turntable ? { turntable } : {}) };
+  const scene = { masks: select("scene-masks").value, up: select("scene-up").value, cameras: select("scene-cameras").value, invert_masks: input("scene-invert").checked, ...(turntable ? { turntable } : {}), ...more };
   // What is small comes first: the server need not take the rest to refuse it.
   const whole = new FormData();
   whole.append("scene", JSON.stringify(scene));
@@ -106,9 +140,10 @@ const post = async (form) => {
 
 /** @param {Picked[]} picked */
 const send = async (picked) => {
-  const { fine, left } = chosenOf(picked), form = new FormData();
+  const { fine, left } = chosenOf(picked), form = new FormData(), more = await search(fine);
+  if (!more) return;
   for (const { path, file } of fine) form.append("files", file, path);
-  await post(form);
+  await post(form, more);
   if (left.length) complain(`${left.length} files are left out, since they cannot be read here: ${left.slice(0, 5).join(", ")}. Save them as JPEG or PNG.`);
 };
 

@@ -23,6 +23,8 @@ export const app = {
   drawn: 0,
   /** @type {?Limits} What the server takes. */
   limits: null,
+  /** @type {{name?: string, missing?: string}} What finds the cameras of photos that have none, or why nothing does. */
+  finder: {},
 };
 
 /** Those who want to hear that one looks from elsewhere. */

@@ -18,7 +18,10 @@ use std::{
 use freerange_gaussians::{Gaussians, channel};
 use freerange_scene::camera::{Camera, View};
 use freerange_scene::estimate::LeaveOneOut;
-use freerange_serve::{Engine, EngineError, Example, JobOptions, Outcome, Scene, ServeConfig, Server, Step, Stopper};
+use freerange_serve::{
+    Engine, EngineError, Example, FoundCameras, JobOptions, Outcome, Scene, Search, SearchStep, ServeConfig, Server,
+    Step, Stopper,
+};
 use image::RgbaImage;
 use serde_json::Value;
 
@@ -49,6 +52,24 @@ pub struct Fake {
     pub running: AtomicUsize,
     pub most_at_once: AtomicUsize,
     pub panics: bool,
+    /// What a search for cameras ends with.
+    pub finds: Finds,
+    /// Searches that were begun, and photos of each.
+    pub searches: Mutex<Vec<Vec<String>>>,
+}
+
+/// What a search for cameras ends with.
+#[derive(Default)]
+pub enum Finds {
+    /// There is nothing that searches.
+    #[default]
+    Nobody,
+    /// The example's cameras, and a warning.
+    Cameras,
+    /// A refusal; `SCENE` and `PHOTOS` are the places of these.
+    Refused(&'static str),
+    /// It goes on until it is stopped.
+    Waits,
 }
 
 impl Fake {
@@ -126,6 +147,51 @@ impl Engine for Fake {
     fn picture(&self, cloud: &Gaussians, camera: &Camera) -> Result<RgbaImage, String> {
         let shade = (cloud.len() % 256) as u8;
         Ok(RgbaImage::from_pixel(camera.width, camera.height, image::Rgba([shade, 0, 0, 255])))
+    }
+
+    fn camera_finder(&self) -> Result<String, String> {
+        match self.finds {
+            Finds::Nobody => Err("nobody here finds cameras".into()),
+            _ => Ok("a finder".into()),
+        }
+    }
+
+    fn find_cameras(
+        &self,
+        search: &Search<'_>,
+        tell: &mut dyn FnMut(&SearchStep),
+    ) -> Result<FoundCameras, EngineError> {
+        let mut names = files(search.photos);
+        names.sort();
+        self.searches.lock().unwrap().push(names);
+        assert!(search.work.is_dir() && search.scene.read_dir().unwrap().next().is_none());
+        tell(&SearchStep { stage: "matches", done: 1, total: 6 });
+        match self.finds {
+            Finds::Nobody => panic!("nobody was asked"),
+            Finds::Cameras => {
+                for (name, bytes) in EXAMPLE.files {
+                    let path = search.scene.join(name);
+                    std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+                    std::fs::write(path, bytes).unwrap();
+                }
+                Ok(FoundCameras {
+                    notes: vec!["4 of 4 photos".into()],
+                    warnings: vec!["few (--uneven if they did)".into()],
+                })
+            }
+            Finds::Refused(text) => {
+                let place = |path: &Path| path.display().to_string();
+                Err(EngineError::Input(
+                    text.replace("SCENE", &place(search.scene)).replace("PHOTOS", &place(search.photos)),
+                ))
+            }
+            Finds::Waits => {
+                while search.stop.check().is_ok() {
+                    thread::sleep(Duration::from_millis(5));
+                }
+                Err(EngineError::Cancelled)
+            }
+        }
     }
 }
 
