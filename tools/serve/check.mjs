@@ -87,7 +87,7 @@ const SUM = "window.viewers[0].rows.reduce((sum, v, i) => sum + v * ((i % 97) + 
 try {
   await send("Emulation.setEmulatedMedia", { features: [{ name: "prefers-color-scheme", value: "light" }] });
   let bytes = 0;
-  const modules = ["main", "jobs", "job", "gaussians", "panes", "brush", "edit", "send", "record", "dom", "state"].map((name) => `/${name}.js`);
+  const modules = ["main", "jobs", "job", "gaussians", "panes", "brush", "zoom", "edit", "send", "record", "dom", "state"].map((name) => `/${name}.js`);
   for (const path of ["/", "/style.css", "/viewer.js", ...modules]) bytes += (await get(path)).length;
   check("size of the page", bytes < 120_000, `${bytes} bytes`);
 
@@ -168,13 +168,53 @@ try {
   await send("Input.dispatchKeyEvent", { type: "keyDown", key: " ", code: "Space", windowsVirtualKeyCode: 32 });
   await picture("brush");
   await accessible("brush");
+  for (let i = 0; i < 2; i++) await click("#paint-undo");
+  check("undo of the brush", await evaluate("document.getElementById('paint-undo').disabled"), "two strokes taken back");
+  // Larger by the wheel; painted there; moved with Shift; and whole again.
+  const [px, py] = await middle("#paint");
+  await send("Input.dispatchMouseEvent", { type: "mouseWheel", x: px, y: py, deltaX: 0, deltaY: -800 });
+  await until("document.getElementById('paint-text').textContent.startsWith('Zoom 3')");
+  await click("#paint-closer");
+  await drag("#paint", 20, 10);
+  await picture("zoom");
+  check("zoom of the brush", await evaluate("!document.getElementById('paint-undo').disabled"), await evaluate("document.getElementById('paint-text').textContent"));
   await click("#paint-undo");
-  await click("#paint-undo");
+  for (const [type, far] of [["mousePressed", 0], ["mouseMoved", 30], ["mouseReleased", 30]]) await send("Input.dispatchMouseEvent", { type, x: px + far, y: py, button: "left", buttons: 1, modifiers: 8, clickCount: 1 });
+  check("Shift moves the photo", await evaluate("document.getElementById('paint-undo').disabled"), "nothing is painted");
+  await click("#paint-fit");
+  await until("!document.getElementById('paint-text').textContent.startsWith('Zoom')");
+  check("no view is similar", await evaluate("document.getElementById('paint-copy').disabled"), await evaluate("document.getElementById('paint-text').textContent"));
   await click("#paint-add");
   await drag("#paint", 12, 6);
   await click("#paint-save");
   await until("document.querySelector('#photos li:nth-child(2)').textContent.includes('edited')");
   check("an edited mask", true, await evaluate("document.querySelector('#photos li:nth-child(2) .small').textContent"));
+
+  // What is painted goes to similar views: here a copy of the first photo, whose camera is five degrees farther around.
+  const transforms = JSON.parse(readFileSync(join(bowl, "transforms_train.json"), "utf8")), [frame] = transforms.frames, [c, s] = [Math.cos(Math.PI / 36), Math.sin(Math.PI / 36)];
+  const [m0, m1, ...rest] = frame.transform_matrix;
+  transforms.frames.push({ ...frame, file_path: "train/004", transform_matrix: [m0.map((v, i) => c * v - s * m1[i]), m0.map((v, i) => s * v + c * m1[i]), ...rest] });
+  const form = new FormData();
+  form.append("f", new Blob([JSON.stringify(transforms)]), "near/transforms_train.json");
+  for (const i of [0, 1, 2, 3, 4]) form.append("f", new Blob([readFileSync(join(bowl, `train/00${i % 4}.png`))]), `near/train/00${i}.png`);
+  const { id: near } = await (await fetch(`${url}/jobs`, { method: "POST", body: form, headers: { Authorization: `Bearer ${token}` } })).json();
+  await evaluate(`location.hash = "job=${near}"`);
+  await until("document.querySelectorAll('#photos li').length === 5 && document.body.dataset.state === 'ready'", 120);
+  await click("#photos li:nth-child(1) button:not(.look)");
+  await until("document.getElementById('brush').open && !document.getElementById('paint-copy').disabled");
+  const copied = "document.getElementById('paint-copy').getAttribute('aria-pressed')";
+  await click("#paint-copy");
+  check("copy to similar views", await evaluate(copied) === "true", await evaluate("document.getElementById('paint-text').textContent"));
+  await click("#paint-undo");
+  check("undo of the copy", await evaluate(copied) === "false", await evaluate("document.getElementById('paint-text').textContent"));
+  for (const name of ["copy", "erase"]) await click(`#paint-${name}`);
+  await drag("#paint", 40, 10);
+  await click("#paint-save");
+  await until("['1', '5'].every((n) => document.querySelector(`#photos li:nth-child(${n})`).textContent.includes('edited'))");
+  const views = JSON.parse(await get(`/jobs/${near}`)).understood.views;
+  check("painted in both", views[0].covers === views[4].covers && [1, 2, 3].every((i) => !views[i].edited), `${(100 * views[4].covers).toFixed(2)} %`);
+  await evaluate(`location.hash = ${JSON.stringify(shared)}`);
+  await until(`document.querySelectorAll('#photos li').length === 4 && document.body.dataset.state === 'ready'`, 30);
 
   // A row of buttons is one stop of the Tab key.
   await evaluate("document.querySelector('#tools button').focus()");

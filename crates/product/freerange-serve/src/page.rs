@@ -7,7 +7,7 @@ const STYLE: (&str, &str, &str) = ("/style.css", "text/css; charset=utf-8", incl
 
 /// Its files: address, kind, content. The drawing is that of the page that Gaussians are exported to; the other scripts are modules of one
 /// thing each.
-pub const FILES: [(&str, &str, &str); 14] = [
+pub const FILES: [(&str, &str, &str); 15] = [
     ("/", "text/html; charset=utf-8", include_str!("page/index.html")),
     STYLE,
     ("/viewer.js", SCRIPT, viewer::SCRIPT),
@@ -17,6 +17,7 @@ pub const FILES: [(&str, &str, &str); 14] = [
     ("/gaussians.js", SCRIPT, include_str!("page/gaussians.js")),
     ("/panes.js", SCRIPT, include_str!("page/panes.js")),
     ("/brush.js", SCRIPT, include_str!("page/brush.js")),
+    ("/zoom.js", SCRIPT, include_str!("page/zoom.js")),
     ("/edit.js", SCRIPT, include_str!("page/edit.js")),
     ("/send.js", SCRIPT, include_str!("page/send.js")),
     ("/record.js", SCRIPT, include_str!("page/record.js")),
