@@ -8,6 +8,7 @@ mod bin;
 mod math;
 mod normals;
 pub(crate) mod project;
+mod sums;
 mod surface;
 mod tile;
 
@@ -22,7 +23,7 @@ use multiversion::{multiversion, target::target_cfg_f};
 use project::{Pinhole, SUMS, Splat};
 use rayon::prelude::*;
 use std::cell::RefCell;
-use tile::{Band, RowGrads, Rows, Scratch};
+use tile::{Band, RowGrads, Rows};
 
 /// What [`render`] returns. All arrays are row-major.
 #[derive(Debug)]
@@ -53,8 +54,8 @@ pub struct Gradients {
 /// [`RasterConfig::near`]..=[`RasterConfig::far`], the standard deviation in the image exceeds 10^6 pixels, the
 /// center is more than 10^7 pixels away, or a color channel exceeds 10^6. The result is finite.
 ///
-/// The output also holds what [`render_backward`] needs: about 64 bytes per Gaussian and view, and two bytes per
-/// Gaussian and block of 4 x 4 pixels that it reaches.
+/// The output also holds what [`render_backward`] needs: about 64 bytes per Gaussian and view, two bytes per Gaussian and
+/// block of 4 x 4 pixels that it reaches, and eight per pixel.
 ///
 /// # Errors
 /// If a length does not fit, a camera or background is not finite, or the image size is zero, above 16384, or
@@ -333,15 +334,13 @@ fn draw(top: usize, splats: Vec<Splat>, background: [f32; 3], rows: &mut Rows) -
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl+avx2+fma", "x86_64+avx2+fma"))]
 fn draw_backward(band: &Band, background: [f32; 3], grads: &RowGrads) -> (Vec<[f32; SUMS]>, [f32; 3]) {
     const FMA: bool = target_cfg_f!(any(target_feature = "fma", target_arch = "aarch64"));
-    thread_local!(static SCRATCH: RefCell<Scratch> = Default::default());
-    let mut scratch = SCRATCH.take();
+    const AVX2: bool = target_cfg_f!(all(target_arch = "x86_64", target_feature = "avx2", target_feature = "fma"));
     let mut sums = vec![[0f32; SUMS]; band.splats.len()];
     let d_background = if grads.depth.is_empty() {
-        tile::backward::<FMA, false>(band, background, grads, &mut scratch, &mut sums)
+        tile::backward::<FMA, AVX2, false>(band, background, grads, &mut sums)
     } else {
-        tile::backward::<FMA, true>(band, background, grads, &mut scratch, &mut sums)
+        tile::backward::<FMA, AVX2, true>(band, background, grads, &mut sums)
     };
-    SCRATCH.set(scratch);
     (sums, d_background)
 }
 
@@ -381,7 +380,7 @@ mod tests {
         let band = tile::draw::<FMA, true>(0, band, [0.5; 3], &mut Lists::default(), &mut image);
         let grads = RowGrads { width, height, stride: 3, color: &color, alpha: &alpha, depth: &depth };
         let mut sums = vec![[0.0; SUMS]; band.splats.len()];
-        tile::backward::<FMA, true>(&band, [0.5; 3], &grads, &mut Scratch::default(), &mut sums);
+        tile::backward::<FMA, false, true>(&band, [0.5; 3], &grads, &mut sums);
         let mut all = vec![[0.0; SUMS]; 20];
         band.splats.iter().zip(sums).for_each(|(splat, sum)| all[splat.index as usize] = sum);
         let mut out = vec![0.0; rows.len()];

@@ -4,8 +4,9 @@
 //! instruction sets (see `mod.rs`), with loops over lanes that have no branches.
 
 use super::bin::{BAND, BLOCK, CHUNK, Chunk, Lists, blocks_across};
-use super::math::{LANES, exp2, fma, max, min};
+use super::math::{LANES, exp2, fma, min};
 use super::project::{LOG2_255, SUMS, Splat};
+use super::sums;
 
 /// Blending stops before the splat that would take the transmittance to this or below.
 pub const MIN_TRANSMITTANCE: f32 = 1e-4;
@@ -14,7 +15,8 @@ pub const MAX_ALPHA: f32 = 0.99;
 /// How often, in splats, a block is checked for having become opaque.
 const CHECK: usize = 8;
 
-type Pixels = [f32; LANES];
+/// A number for each pixel of a block.
+pub type Pixels = [f32; LANES];
 
 /// Pixel center of each lane, from the corner of its block.
 const X: Pixels = lanes(0, 0.5);
@@ -31,27 +33,23 @@ const fn lanes(axis: usize, offset: f32) -> Pixels {
     out
 }
 
-/// 1, x, y, x^2, x y, y^2 of each lane, from the middle of its block.
-const MOMENTS: [[f32; 8]; LANES] = {
-    let mut out = [[0.0; 8]; LANES];
-    let mut l = 0;
-    while l < LANES {
-        let (x, y) = (X[l] - 0.5 * BLOCK[0] as f32, Y[l] - 0.5 * BLOCK[1] as f32);
-        out[l] = [1.0, x, y, x * x, x * y, y * y, 0.0, 0.0];
-        l += 1;
-    }
-    out
-};
-
 /// The state of the pixels of a block between splats.
 #[derive(Clone, Copy)]
 struct Block {
     /// Transmittance, 0 once blending has stopped.
     t: Pixels,
-    /// Transmittance that the background is seen through.
-    t_final: Pixels,
     rgb: [Pixels; 3],
     depth: Pixels,
+    end: End,
+}
+
+/// Where blending ended at the pixels of a block.
+#[derive(Clone, Copy, Debug)]
+struct End {
+    /// Transmittance that the background is seen through.
+    t: Pixels,
+    /// How many of the block's splats were blended: the first ones.
+    count: [u32; LANES],
 }
 
 /// A band and what it needs to be drawn again, backwards.
@@ -60,7 +58,8 @@ pub struct Band {
     pub top: usize,
     /// From near to far.
     pub splats: Vec<Splat>,
-    pub chunks: Vec<Chunk>,
+    chunks: Vec<Chunk>,
+    ends: Vec<End>, // [blocks]
 }
 
 /// Image rows of a band. `color` has `stride` floats per pixel; if that is 4, the fourth is alpha.
@@ -95,16 +94,21 @@ fn each_inside(x0: usize, y0: usize, width: usize, height: usize, mut f: impl Fn
     }
 }
 
-/// Opacity of `s` at each pixel of the block whose corner is at (`x`, `y`), 0 where below 1/255.
+/// Opacity of `s` at (`dx`, `dy`) from its mean, 0 where below 1/255.
 #[inline(always)]
-fn opacity<const FMA: bool>(s: &Splat, x: f32, y: f32, l: usize) -> f32 {
-    let u0 = fma::<FMA>(s.l11, x - s.x, s.l21 * (y - s.y));
-    let v0 = s.l22 * (y - s.y);
-    let u = fma::<FMA>(s.l11, X[l], fma::<FMA>(s.l21, Y[l], u0));
-    let v = fma::<FMA>(s.l22, Y[l], v0);
+fn opacity<const FMA: bool>(s: &Splat, dx: f32, dy: f32) -> f32 {
+    let u = fma::<FMA>(s.l21, dy, s.l11 * dx);
+    let v = s.l22 * dy;
     let exponent = fma::<FMA>(-u, u, fma::<FMA>(-v, v, s.log2_opacity));
-    let alpha = min(exp2::<FMA>(max(exponent, -20.0)), MAX_ALPHA);
+    // Far away the power is any number, which is not taken.
+    let alpha = min(exp2::<FMA>(exponent), MAX_ALPHA);
     if exponent >= -LOG2_255 { alpha } else { 0.0 }
+}
+
+/// Pixel centers of the block whose corner is at (`x`, `y`).
+#[inline(always)]
+fn centers(x: f32, y: f32) -> [Pixels; 2] {
+    [X.map(|lane| x + lane), Y.map(|lane| y + lane)]
 }
 
 /// Draws a band of splats, which are in depth order, in front of `background`.
@@ -118,7 +122,8 @@ pub fn draw<const FMA: bool, const DEPTH: bool>(
 ) -> Band {
     let across = blocks_across(rows.width);
     let count = across * rows.height.div_ceil(BLOCK[1]);
-    let empty = Block { t: [0.0; LANES], t_final: [1.0; LANES], rgb: [[0.0; LANES]; 3], depth: [0.0; LANES] };
+    let end = End { t: [1.0; LANES], count: [0; LANES] };
+    let empty = Block { t: [0.0; LANES], rgb: [[0.0; LANES]; 3], depth: [0.0; LANES], end };
     let mut blocks = vec![empty; count];
     for (i, block) in blocks.iter_mut().enumerate() {
         each_inside(i % across * BLOCK[0], i / across * BLOCK[1], rows.width, rows.height, |l, _| block.t[l] = 1.0);
@@ -143,7 +148,7 @@ pub fn draw<const FMA: bool, const DEPTH: bool>(
     }
     for (i, block) in blocks.iter().enumerate() {
         each_inside(i % across * BLOCK[0], i / across * BLOCK[1], rows.width, rows.height, |l, pixel| {
-            let t = block.t_final[l];
+            let t = block.end.t[l];
             for c in 0..3 {
                 rows.color[pixel * rows.stride + c] = fma::<FMA>(t, background[c], block.rgb[c][l]);
             }
@@ -157,21 +162,24 @@ pub fn draw<const FMA: bool, const DEPTH: bool>(
             }
         });
     }
-    Band { top, splats, chunks }
+    Band { top, splats, chunks, ends: blocks.iter().map(|block| block.end).collect() }
 }
 
 /// Blends the splats `list` of `run` into the block whose corner is at (`x`, `y`). Whether it can take more.
 #[inline(always)]
 fn blend<const FMA: bool, const DEPTH: bool>(block: &mut Block, run: &[Splat], list: &[u16], x: f32, y: f32) -> bool {
-    let Block { mut t, mut t_final, rgb: [mut red, mut green, mut blue], mut depth } = *block;
+    let Block { mut t, rgb: [mut red, mut green, mut blue], mut depth, end } = *block;
+    let End { t: mut t_final, mut count } = end;
+    let [px, py] = centers(x, y);
     let mut open = true;
     for group in list.chunks(CHECK) {
         for &i in group {
             let s = &run[usize::from(i)];
             for l in 0..LANES {
-                let alpha = opacity::<FMA>(s, x, y, l);
+                let alpha = opacity::<FMA>(s, px[l] - s.x, py[l] - s.y);
                 let next = t[l] * (1.0 - alpha);
                 let go_on = next > MIN_TRANSMITTANCE;
+                count[l] += u32::from(go_on);
                 let weight = if go_on { t[l] * alpha } else { 0.0 };
                 t[l] = if go_on { next } else { 0.0 };
                 t_final[l] = if go_on { next } else { t_final[l] };
@@ -188,40 +196,26 @@ fn blend<const FMA: bool, const DEPTH: bool>(block: &mut Block, run: &[Splat], l
             break;
         }
     }
-    *block = Block { t, t_final, rgb: [red, green, blue], depth };
+    *block = Block { t, rgb: [red, green, blue], depth, end: End { t: t_final, count } };
     open
-}
-
-/// What the splats of one block do at each of its pixels, from near to far. Outlives a call, and only grows.
-#[derive(Default)]
-pub struct Scratch {
-    /// Positions in the band.
-    splats: Vec<u32>,
-    /// First alpha, later d loss / d ln(alpha); and the blending weight.
-    pixels: Vec<[Pixels; 2]>,
-    /// How many of them are in use.
-    count: usize,
 }
 
 /// Pulls d loss / d image back to the splats of `band`: `sums` has a row for each, see [`SUMS`]. Returns
 /// d loss / d background.
 #[inline(always)]
-pub fn backward<const FMA: bool, const DEPTH: bool>(
+pub fn backward<const FMA: bool, const AVX2: bool, const DEPTH: bool>(
     band: &Band,
     background: [f32; 3],
     grads: &RowGrads,
-    scratch: &mut Scratch,
     sums: &mut [[f32; SUMS]],
 ) -> [f32; 3] {
     let across = blocks_across(grads.width);
     let mut d_background = [0f32; 3];
-    for i in 0..across * grads.height.div_ceil(BLOCK[1]) {
+    for (i, end) in band.ends.iter().enumerate() {
         let (x0, y0) = (i % across * BLOCK[0], i / across * BLOCK[1]);
-        let mut t = [0f32; LANES];
         let mut d = [[0f32; LANES]; 4]; // d loss / d (red, green, blue, depth)
         let mut behind = [0f32; LANES]; // the color seen behind the last splat, times d loss / d color
         each_inside(x0, y0, grads.width, grads.height, |l, pixel| {
-            t[l] = 1.0;
             for c in 0..3 {
                 d[c][l] = grads.color[pixel * grads.stride + c];
                 behind[l] += d[c][l] * background[c];
@@ -235,136 +229,61 @@ pub fn backward<const FMA: bool, const DEPTH: bool>(
                 d[3][l] = grads.depth[pixel];
             }
         });
-        let corner = [x0 as f32, (band.top + y0) as f32];
-        let t_final = near_to_far::<FMA>(band, i, corner, t, scratch);
         for c in 0..3 {
-            d_background[c] += t_final.iter().zip(&d[c]).map(|(t, d)| t * d).sum::<f32>();
+            d_background[c] += end.t.iter().zip(&d[c]).map(|(t, d)| t * d).sum::<f32>();
         }
-        far_to_near::<FMA, DEPTH>(band, behind, &d, scratch);
-        add_up::<FMA>(band, corner, &d, scratch, sums);
+        let centers = centers(x0 as f32, (band.top + y0) as f32);
+        far_to_near::<FMA, AVX2, DEPTH>(band, i, centers, behind, &d, sums);
     }
     d_background
 }
 
-/// Blends the splats of `block` as [`draw`] did, noting alpha and weight of each. `t` is 1 at pixels of the image.
-/// Returns the transmittance of all of them.
+/// Goes through the splats of `block` from far to near, and adds what they do at its pixels to their rows of `sums`.
+///
+/// The transmittance in front of a splat follows from that behind it, t / (1 - alpha); what is seen in front of it
+/// likewise: behind += alpha (color - behind), where colors are times d loss / d color.
 #[inline(always)]
-fn near_to_far<const FMA: bool>(
+fn far_to_near<const FMA: bool, const AVX2: bool, const DEPTH: bool>(
     band: &Band,
     block: usize,
-    [x, y]: [f32; 2],
-    mut t: Pixels,
-    scratch: &mut Scratch,
-) -> Pixels {
-    let mut t_final = [1f32; LANES];
-    // Room for all beforehand: a call that may grow a vector would push the lanes out of the registers.
-    let count = band.chunks.iter().map(|chunk| chunk.of_block(block).len()).sum();
-    if scratch.splats.len() < count {
-        scratch.splats.resize(count, 0);
-        scratch.pixels.resize(count, [[0.0; LANES]; 2]);
-    }
-    let mut k = 0;
-    for chunk in &band.chunks {
-        let run = &band.splats[chunk.first..];
-        for group in chunk.of_block(block).chunks(CHECK) {
-            for &i in group {
-                let s = &run[usize::from(i)];
-                let mut noted = [[0f32; LANES]; 2];
-                for l in 0..LANES {
-                    let alpha = opacity::<FMA>(s, x, y, l);
-                    let next = t[l] * (1.0 - alpha);
-                    let go_on = next > MIN_TRANSMITTANCE;
-                    noted[0][l] = if go_on { alpha } else { 0.0 };
-                    noted[1][l] = if go_on { t[l] * alpha } else { 0.0 };
-                    t[l] = if go_on { next } else { 0.0 };
-                    t_final[l] = if go_on { next } else { t_final[l] };
-                }
-                scratch.splats[k] = (chunk.first + usize::from(i)) as u32;
-                scratch.pixels[k] = noted;
-                k += 1;
-            }
-            if t.iter().fold(0, |any, v| any | v.to_bits()) == 0 {
-                scratch.count = k;
-                return t_final;
-            }
-        }
-    }
-    scratch.count = k;
-    t_final
-}
-
-/// Replaces the alphas by d loss / d ln(alpha) = weight (color - color behind), where colors are times
-/// d loss / d color. What is seen in front of a splat follows from what is seen behind it:
-/// behind += alpha (color - behind).
-#[inline(always)]
-fn far_to_near<const FMA: bool, const DEPTH: bool>(
-    band: &Band,
+    [px, py]: [Pixels; 2],
     mut behind: Pixels,
     d: &[Pixels; 4],
-    scratch: &mut Scratch,
-) {
-    let d = *d;
-    let count = scratch.count;
-    for (&i, pixels) in scratch.splats[..count].iter().zip(&mut scratch.pixels[..count]).rev() {
-        let s = &band.splats[i as usize];
-        let [alpha, weight] = *pixels;
-        let mut g = [0f32; LANES];
-        for l in 0..LANES {
-            let mut color = s.color[0] * d[0][l];
-            color = fma::<FMA>(s.color[1], d[1][l], color);
-            color = fma::<FMA>(s.color[2], d[2][l], color);
-            if DEPTH {
-                color = fma::<FMA>(s.depth, d[3][l], color);
-            }
-            let difference = color - behind[l];
-            behind[l] = fma::<FMA>(alpha[l], difference, behind[l]);
-            // No derivative through the upper bound on alpha.
-            g[l] = if alpha[l] < MAX_ALPHA { weight[l] * difference } else { 0.0 };
-        }
-        pixels[0] = g;
-    }
-}
-
-/// Sums over the pixels of the block: products with fixed columns, a small matrix product.
-#[inline(always)]
-fn add_up<const FMA: bool>(
-    band: &Band,
-    [x, y]: [f32; 2],
-    d: &[Pixels; 4],
-    scratch: &Scratch,
     sums: &mut [[f32; SUMS]],
 ) {
-    let mut columns = [[0f32; 4]; LANES];
-    for l in 0..LANES {
-        columns[l] = [d[0][l], d[1][l], d[2][l], d[3][l]];
-    }
-    // Rows of eight as they are: knowing the numbers, the compiler would take them apart.
-    let moments = std::hint::black_box(&MOMENTS);
-    let middle = [x + 0.5 * BLOCK[0] as f32, y + 0.5 * BLOCK[1] as f32];
-    for (&i, [g, weight]) in scratch.splats[..scratch.count].iter().zip(&scratch.pixels) {
-        let mut m = [0f32; 8];
-        let mut color = [0f32; 4];
-        for l in 0..LANES {
-            for k in 0..8 {
-                m[k] = fma::<FMA>(g[l], moments[l][k], m[k]);
+    let End { mut t, count } = band.ends[block];
+    let d = *d;
+    let blended = count.iter().fold(0, |most, count| most.max(*count as usize));
+    let mut first: usize = band.chunks.iter().map(|chunk| chunk.of_block(block).len()).sum();
+    for chunk in band.chunks.iter().rev() {
+        let list = chunk.of_block(block);
+        first -= list.len();
+        let list = &list[..list.len().min(blended.saturating_sub(first))];
+        for (k, &i) in list.iter().enumerate().rev() {
+            let (k, i) = ((first + k) as u32, chunk.first + usize::from(i));
+            let s = &band.splats[i];
+            let mut pixels = sums::Terms::default();
+            for l in 0..LANES {
+                let (dx, dy) = (px[l] - s.x, py[l] - s.y);
+                let alpha = opacity::<FMA>(s, dx, dy);
+                let alpha = if k < count[l] { alpha } else { 0.0 };
+                t[l] /= 1.0 - alpha;
+                let weight = alpha * t[l];
+                let mut color = s.color[0] * d[0][l];
+                color = fma::<FMA>(s.color[1], d[1][l], color);
+                color = fma::<FMA>(s.color[2], d[2][l], color);
+                if DEPTH {
+                    color = fma::<FMA>(s.depth, d[3][l], color);
+                }
+                let difference = color - behind[l];
+                behind[l] = fma::<FMA>(alpha, difference, behind[l]);
+                // d loss / d ln(alpha). No derivative through the upper bound on alpha.
+                pixels.g[l] = if alpha < MAX_ALPHA { weight * difference } else { 0.0 };
+                pixels.weight[l] = weight;
+                pixels.dx[l] = dx;
+                pixels.dy[l] = dy;
             }
-            for k in 0..4 {
-                color[k] = fma::<FMA>(weight[l], columns[l][k], color[k]);
-            }
-        }
-        // Moments about the mean of the splat instead of the middle of the block.
-        let s = &band.splats[i as usize];
-        let (cx, cy) = (middle[0] - s.x, middle[1] - s.y);
-        let (sx, sy) = (fma::<FMA>(cx, m[0], m[1]), fma::<FMA>(cy, m[0], m[2]));
-        let sum = &mut sums[i as usize];
-        sum[0] += m[0];
-        sum[1] += sx;
-        sum[2] += sy;
-        sum[3] += m[3] + cx * (m[1] + sx);
-        sum[4] += m[4] + cy * m[1] + cx * sy;
-        sum[5] += m[5] + cy * (m[2] + sy);
-        for k in 0..4 {
-            sum[6 + k] += color[k];
+            sums::add::<AVX2, DEPTH>(&pixels, &d, &mut sums[i]);
         }
     }
 }
