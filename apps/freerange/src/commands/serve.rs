@@ -316,11 +316,7 @@ impl Engine for Local {
         self.finder.name()
     }
 
-    fn find_cameras(
-        &self,
-        search: &Search<'_>,
-        tell: &mut dyn FnMut(&SearchStep),
-    ) -> Result<FoundCameras, EngineError> {
+    fn find_cameras(&self, search: &Search<'_>, tell: &mut dyn FnMut(SearchStep)) -> Result<FoundCameras, EngineError> {
         self.finder.find(search, tell)
     }
 }

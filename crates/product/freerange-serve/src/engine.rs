@@ -50,8 +50,7 @@ pub trait Engine: Send + Sync + 'static {
     ///
     /// # Errors
     /// Says whose fault it is: doubtful cameras are the input's. [`EngineError::Cancelled`] where `search.stop` says so.
-    fn find_cameras(&self, search: &Search<'_>, tell: &mut dyn FnMut(&SearchStep))
-    -> Result<FoundCameras, EngineError>;
+    fn find_cameras(&self, search: &Search<'_>, tell: &mut dyn FnMut(SearchStep)) -> Result<FoundCameras, EngineError>;
 }
 
 /// Photos without cameras.

@@ -48,7 +48,7 @@ impl Finder {
     }
 
     /// Finds the cameras of photos.
-    pub fn find(&self, search: &Search<'_>, tell: &mut dyn FnMut(&SearchStep)) -> Result<FoundCameras, EngineError> {
+    pub fn find(&self, search: &Search<'_>, tell: &mut dyn FnMut(SearchStep)) -> Result<FoundCameras, EngineError> {
         let engine = self.engine().ok_or_else(|| EngineError::Input(MISSING.into()))?;
         let masks: PathBuf = search.photos.join("masks");
         let poses = poses::Search {
@@ -67,7 +67,7 @@ impl Finder {
         let files = photos_in(search.photos).map_err(|e| told(e.into()))?;
         let found = poses.run(&files, &mut |news| {
             if let Told::Step(stage, _, done) = news {
-                tell(&SearchStep { stage, done: done as usize, total: STEPS as usize + 1 });
+                tell(SearchStep { stage, done: done as usize, total: STEPS as usize + 1 });
             }
         });
         if search.stop.check().is_err() {

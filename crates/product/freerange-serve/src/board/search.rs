@@ -55,7 +55,7 @@ impl Board {
             memory: self.limits.search_memory,
             photos_memory: self.limits.memory,
         };
-        let found = self.engine.find_cameras(&search, &mut |step| self.searched(id, *step));
+        let found = self.engine.find_cameras(&search, &mut |step| self.searched(id, step));
         let plain = |text: &str| {
             plain::sentence(&text.replace(&scene.display().to_string(), &photos.display().to_string()), &photos)
         };

@@ -156,16 +156,12 @@ impl Engine for Fake {
         }
     }
 
-    fn find_cameras(
-        &self,
-        search: &Search<'_>,
-        tell: &mut dyn FnMut(&SearchStep),
-    ) -> Result<FoundCameras, EngineError> {
+    fn find_cameras(&self, search: &Search<'_>, tell: &mut dyn FnMut(SearchStep)) -> Result<FoundCameras, EngineError> {
         let mut names = files(search.photos);
         names.sort();
         self.searches.lock().unwrap().push(names);
         assert!(search.work.is_dir() && search.scene.read_dir().unwrap().next().is_none());
-        tell(&SearchStep { stage: "matches", done: 1, total: 6 });
+        tell(SearchStep { stage: "matches", done: 1, total: 6 });
         match self.finds {
             Finds::Nobody => panic!("nobody was asked"),
             Finds::Cameras => {
