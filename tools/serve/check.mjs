@@ -434,7 +434,8 @@ try {
   // Anywhere on the page.
   const one = { items: [], files: [ply], dragOperationsMask: 1 };
   for (const type of ["dragEnter", "dragOver", "drop"]) await send("Input.dispatchDragEvent", { type, x, y, data: one });
-  await until(`location.hash.slice(5) !== ${JSON.stringify(id)} && document.body.dataset.state === "done" && window.viewers[0]?.count === ${all}`, 60);
+  await until(`location.hash.slice(5) !== ${JSON.stringify(id)} && document.body.dataset.result === location.hash.slice(5) && window.viewers[0]?.count === ${all}`, 60);
+  check("no seed of a file", !(await evaluate("document.getElementById('result').textContent + document.querySelector('#views').textContent")).match(/seed/i), await evaluate("document.querySelector('figcaption').textContent"));
   check("a dropped file of Gaussians", await evaluate("document.querySelectorAll('#downloads a').length") === job.formats.length, await evaluate("document.getElementById('notes').textContent"));
   await accessible("with a file of Gaussians");
   await picture("splats");

@@ -1,5 +1,7 @@
 //! The page, which is part of the program.
 
+use std::sync::LazyLock;
+
 use freerange_gaussians::formats::viewer;
 
 const SCRIPT: &str = "text/javascript; charset=utf-8";
@@ -30,7 +32,10 @@ pub const OPEN: [(&str, &str, &str); 2] = [STYLE, ("/enter.js", SCRIPT, include_
 
 /// Asks for the token; the same after a wrong one; and goes on to the page by itself.
 pub const LOGIN: &str = include_str!("page/login.html");
-pub const REFUSED: &str = include_str!("page/refused.html");
+pub static REFUSED: LazyLock<String> = LazyLock::new(|| LOGIN.replace(NOTHING_WRONG, WRONG));
+/// What the form says, and what it says after a wrong token.
+const NOTHING_WRONG: &str = r#"role="alert"></p>"#;
+const WRONG: &str = r#"role="alert">That is not the token of this server.</p>"#;
 pub const ENTER: &str = include_str!("page/enter.html");
 
 #[cfg(test)]
@@ -41,7 +46,8 @@ mod tests {
     fn the_page_is_small_and_names_nothing_outside() {
         let size: usize = FILES.iter().map(|(_, _, text)| text.len()).sum();
         assert!(size < 120_000, "{size} bytes");
-        let others = [LOGIN, REFUSED, ENTER].map(|text| ("before the token", "", text));
+        assert!(REFUSED.contains(WRONG));
+        let others = [LOGIN, &REFUSED, ENTER].map(|text| ("before the token", "", text));
         for (name, _, text) in FILES.into_iter().chain(OPEN).chain(others) {
             for odd in [
                 "https://",

@@ -195,7 +195,7 @@ fn login(site: &Site, request: &mut Request) -> Option<Answer> {
         let text = match (elsewhere && told.is_none(), told) {
             (true, _) => page::ENTER,
             (_, None) => page::LOGIN,
-            (_, Some(_)) => page::REFUSED,
+            (_, Some(_)) => &page::REFUSED,
         };
         return Some(Ok(Response::new("text/html; charset=utf-8", Content::Text(text)).status(401)));
     }

@@ -1,5 +1,6 @@
 // Parts of a result left out: what lies outside of a box, and what floats apart from the object. Each step is saved, and can be undone.
 import { attempt, box, button, call, get, input, make } from "./dom.js";
+import { caption, seedOf } from "./gaussians.js";
 import { app, viewed } from "./state.js";
 
 const CHANNELS = 14;
@@ -83,8 +84,8 @@ const save = async (kept, undoes = false) => {
   edit.kept = kept;
   whole();
   show(kept);
-  const pane = app.panes[edit.sample], sample = app.job?.samples[edit.sample];
-  if (pane && sample) pane.caption.textContent = `seed ${sample.seed}, ${gaussians.toLocaleString("en")} Gaussians`;
+  const pane = app.panes[edit.sample];
+  if (pane) caption(pane, edit.sample, gaussians);
   viewed.dispatchEvent(new Event("viewed"));
 };
 
@@ -138,7 +139,7 @@ export const offerEdit = () => {
   const { job } = app, select = get("edit-sample", HTMLSelectElement);
   edit = null;
   get("edit", HTMLDetailsElement).open = false;
-  select.replaceChildren(...(job?.samples ?? []).map((sample, i) => make("option", { value: String(i) }, `seed ${sample.seed}`)));
+  select.replaceChildren(...(job ? job.samples.map((_, i) => make("option", { value: String(i) }, seedOf(job, i, ""))) : []));
   box("edit-which").hidden = select.options.length < 2;
 };
 const start = () => void attempt(() => begin(Number(get("edit-sample", HTMLSelectElement).value)));

@@ -40,12 +40,23 @@ export const estimates = async () => {
 };
 
 /**
+ * The seed of a sample, before other words; a file of Gaussians has none.
+ * @param {Job} job
+ * @param {number} i
+ * @param {string} end
+ */
+export const seedOf = (job, i, end) => {
+  const isFile = job.understood?.views.length === 0, done = job.state === "done" ? job.samples[i]?.seed : undefined;
+  return isFile ? "" : `seed ${done ?? (job.options.seed ?? 0) + i}${end}`;
+};
+
+/**
  * @param {Pane} pane
  * @param {number} i
  * @param {number} count
  */
 export const caption = (pane, i, count) => {
-  pane.caption.textContent = `seed ${(app.job?.options.seed ?? 0) + i}, ${count.toLocaleString("en")} Gaussians`;
+  pane.caption.textContent = `${app.job ? seedOf(app.job, i, ", ") : ""}${count.toLocaleString("en")} Gaussians`;
   pane.viewer.canvas.setAttribute("aria-label", `3D view: ${pane.caption.textContent}`);
 };
 
@@ -56,7 +67,6 @@ export const results = async (of) => {
     if (!gaussians || app.job?.id !== of.id || app.job.state !== of.state) return;
     app.panes[i].viewer.setGaussians(gaussians);
     caption(app.panes[i], i, of.samples[i].gaussians);
-    app.panes[i].caption.textContent = `seed ${of.samples[i].seed}, ${of.samples[i].gaussians.toLocaleString("en")} Gaussians`;
   }
   document.body.dataset.result = of.id;
   soonHeat();

@@ -7,7 +7,7 @@
 import { openBrush } from "./brush.js";
 import { attempt, box, button, get, make } from "./dom.js";
 import { offerEdit } from "./edit.js";
-import { caption, results } from "./gaussians.js";
+import { caption, results, seedOf } from "./gaussians.js";
 import { look, showPanes } from "./panes.js";
 import { app } from "./state.js";
 
@@ -94,8 +94,8 @@ export const showJob = () => {
   }
   box("result").hidden = busy || now.samples.length === 0;
   box("film-tools").hidden = busy || now.samples.length === 0;
-  box("downloads").replaceChildren(...now.samples.map((sample, i) => make("li", {}, `Seed ${sample.seed}: `,
-    ...now.formats.map((format) => make("a", { href: `/jobs/${now.id}/samples/${i}.${format}`, download: "", "aria-label": `Seed ${sample.seed} as .${format}` }, `.${format}`)))));
+  box("downloads").replaceChildren(...now.samples.map((_, i) => make("li", {}, seedOf(now, i, ": ").replace("s", "S"),
+    ...now.formats.map((format) => make("a", { href: `/jobs/${now.id}/samples/${i}.${format}`, download: "", "aria-label": `${seedOf(now, i, "") || "Gaussians"} as .${format}` }, `.${format}`)))));
   if (!busy && now.samples.length) void results(now);
   offerEdit();
 };
