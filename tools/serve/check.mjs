@@ -87,7 +87,7 @@ const SUM = "window.viewers[0].rows.reduce((sum, v, i) => sum + v * ((i % 97) + 
 try {
   await send("Emulation.setEmulatedMedia", { features: [{ name: "prefers-color-scheme", value: "light" }] });
   let bytes = 0;
-  const modules = ["main", "jobs", "job", "gaussians", "panes", "brush", "zoom", "edit", "send", "record", "dom", "state"].map((name) => `/${name}.js`);
+  const modules = ["main", "jobs", "job", "gaussians", "panes", "brush", "zoom", "edit", "send", "record", "gif", "dom", "state"].map((name) => `/${name}.js`);
   for (const path of ["/", "/style.css", "/viewer.js", ...modules]) bytes += (await get(path)).length;
   check("size of the page", bytes < 120_000, `${bytes} bytes`);
 
@@ -287,9 +287,28 @@ try {
   await click("#film");
   await until("Number(document.body.dataset.film) > 1000 && window.saved.length === 1", 60);
   check("turntable", true, `${await evaluate("window.saved[0]")}, ${await evaluate("document.body.dataset.film")} bytes`);
+  // The same as a GIF, decoded by the browser.
+  await evaluate("window.blobs = []; window.make = URL.createObjectURL; URL.createObjectURL = (blob) => (window.blobs.push(blob), window.make.call(URL, blob)); true");
+  await click("#gif");
+  await until("window.saved.length === 2", 120);
+  await evaluate("URL.createObjectURL = window.make");
+  const animation = await evaluate(`(async () => {
+    const data = await window.blobs[0].arrayBuffer(), decoder = new ImageDecoder({ type: "image/gif", data });
+    await decoder.tracks.ready;
+    const pixels = async (frameIndex) => {
+      const { image } = await decoder.decode({ frameIndex }), context = new OffscreenCanvas(image.displayWidth, image.displayHeight).getContext("2d");
+      context.drawImage(image, 0, 0);
+      return context.getImageData(0, 0, image.displayWidth, image.displayHeight);
+    };
+    const track = decoder.tracks.selectedTrack, [one, half] = [await pixels(0), await pixels(track.frameCount / 2)];
+    const moved = one.data.reduce((sum, v, i) => sum + Number(Math.abs(v - half.data[i]) > 20), 0) / one.data.length;
+    return { head: new TextDecoder().decode(data.slice(0, 6)), frames: track.frameCount, again: String(track.repetitionCount), width: one.width, height: one.height, moved, bytes: data.byteLength };
+  })()`);
+  const gif = `${animation.frames} frames of ${animation.width} x ${animation.height}, ${animation.bytes} bytes, ${(100 * animation.moved).toFixed(0)} % of it moves`;
+  check("turntable as a GIF", animation.head === "GIF89a" && animation.frames === 48 && animation.again === "Infinity" && animation.width === 360 && animation.height === 270 && animation.moved > 0.01, gif);
   await click("#shot");
-  await until("window.saved.length === 2");
-  check("a picture", (await evaluate("window.saved[1]")).endsWith("-0.png"), await evaluate("window.saved[1]"));
+  await until("window.saved.length === 3");
+  check("a picture", (await evaluate("window.saved[2]")).endsWith("-0.png"), await evaluate("window.saved[2]"));
   await evaluate("delete HTMLAnchorElement.prototype.click");
   await click("#auto");
   const turned = await evaluate("window.viewers[0].orbit.azimuth");

@@ -1,9 +1,12 @@
 // Pictures and films of the result: a screenshot, a turntable, the whole screen, turning by itself.
 import { attempt, box, button, complain, save, toolbar } from "./dom.js";
+import { gif } from "./gif.js";
 import { app } from "./state.js";
 
 /** Seconds of a whole turn, by itself and as a film. */
 const TURN = 12, FILM = 6;
+/** Frames of a GIF, and the longer side of it in pixels. */
+const FRAMES = 48, SIDE = 360;
 const KINDS = ["video/webm;codecs=vp9", "video/webm;codecs=vp8", "video/webm"];
 
 const title = () => (app.job?.title ?? "").replace(/[^\w-]+/g, "-").replace(/^-+|-+$/g, "") || "gaussians";
@@ -41,14 +44,28 @@ button("shot").addEventListener("click", () => void attempt(async () => {
   }
 }));
 
+/**
+ * Has a button say how far its work is.
+ * @param {HTMLButtonElement} by
+ * @param {(told: (share: number) => void) => Promise<void>} work
+ */
+const recording = async (by, work) => {
+  const before = by.textContent;
+  turn(false);
+  by.disabled = true;
+  try {
+    await work((share) => { by.textContent = `Recording: ${Math.round(100 * share)} %`; });
+  } finally {
+    Object.assign(by, { disabled: false, textContent: before });
+    by.focus();
+  }
+};
+
 /** One turn of the first view, as the browser records it. */
 const film = async () => {
   const viewer = app.panes[0]?.viewer, mimeType = KINDS.find((kind) => MediaRecorder.isTypeSupported(kind));
   if (!viewer || !mimeType) throw new Error("this browser records no WebM");
-  turn(false);
-  const record = button("film"), before = record.textContent;
-  record.disabled = true;
-  try {
+  await recording(button("film"), async (told) => {
     const recorder = new MediaRecorder(viewer.canvas.captureStream(30), { mimeType, videoBitsPerSecond: 8e6 });
     /** @type {Blob[]} */
     const parts = [];
@@ -62,19 +79,39 @@ const film = async () => {
       const now = Math.min(1, (performance.now() - begin) / 1000 / FILM);
       viewer.turn(2 * Math.PI * (now - at), 0);
       at = now;
-      record.textContent = `Recording: ${Math.round(100 * at)} %`;
+      told(at);
     }
     recorder.stop();
     await ended;
     save(new Blob(parts, { type: "video/webm" }), `${title()}.webm`);
     document.body.dataset.film = String(parts.reduce((sum, part) => sum + part.size, 0));
-  } finally {
-    Object.assign(record, { disabled: false, textContent: before });
-    record.focus();
-  }
+  });
 };
 button("film").hidden = !("MediaRecorder" in window) || !("captureStream" in HTMLCanvasElement.prototype);
 button("film").addEventListener("click", () => void attempt(film));
+
+/** The same as a GIF: smaller, of 256 colors, and every frame whole. */
+const animation = async () => {
+  const viewer = app.panes[0]?.viewer;
+  if (!viewer) return;
+  const [w, h] = viewer.size(), scale = Math.min(1, SIDE / Math.max(w, h)), width = Math.max(1, Math.round(scale * w)), height = Math.max(1, Math.round(scale * h));
+  const context = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
+  if (!context) throw new Error("this browser draws no images");
+  await recording(button("gif"), async (told) => {
+    /** @type {Uint8ClampedArray[]} */
+    const frames = [];
+    for (let i = 0; i < FRAMES; i++) {
+      viewer.turn(2 * Math.PI / FRAMES, 0);
+      viewer.draw(); // a picture lasts until its task ends
+      context.drawImage(viewer.canvas, 0, 0, width, height);
+      frames.push(context.getImageData(0, 0, width, height).data);
+      told((i + 1) / FRAMES);
+      await new Promise(requestAnimationFrame);
+    }
+    save(gif(frames, width, height, Math.round(100 * FILM / FRAMES)), `${title()}.gif`);
+  });
+};
+button("gif").addEventListener("click", () => void attempt(animation));
 
 button("link").addEventListener("click", () => void attempt(async () => {
   await navigator.clipboard.writeText(location.href);
