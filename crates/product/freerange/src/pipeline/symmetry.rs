@@ -8,11 +8,11 @@
 use std::ops::ControlFlow;
 
 use freerange_optim::{
-    Axis, Evidence, FoundAxis, FoundMirror, Mirror, Silhouette, axis_steps, find_axis, find_mirror, mirror_steps,
-    mirrored, turned,
+    Axis, Evidence, FitError, FoundAxis, FoundMirror, Mirror, Silhouette, axis_steps, find_axis, find_mirror,
+    mirror_steps, mirrored, turned,
 };
 use freerange_scene::camera::View;
-use freerange_util::Note;
+use freerange_util::{Note, side_by_side};
 
 use super::{
     CanonicalScene,
@@ -22,6 +22,17 @@ use crate::{Detect, Error, PipelineConfig, Stage, error::Lift};
 
 /// Photos beyond which no symmetry is looked for: so many were measured, and the network sees at most twice as many.
 const MOST_PHOTOS: usize = 4;
+
+/// What one of the searches found.
+enum Found {
+    Axis(Option<FoundAxis>),
+    Mirror(Option<FoundMirror>),
+}
+
+/// Hears how many steps of a search are done.
+type Tell<'a> = dyn FnMut(usize) -> ControlFlow<()> + 'a;
+/// A search.
+type Job<'a> = Box<dyn FnOnce(&mut Tell<'_>) -> Result<Found, FitError> + Send + 'a>;
 
 /// What was found.
 #[derive(Default)]
@@ -58,24 +69,34 @@ pub(crate) fn detect(
         let text = format!("no symmetry is looked for: there are more than {MOST_PHOTOS} photos");
         return Ok(Symmetry { notes: vec![Note::understood(text)], ..Symmetry::default() });
     }
-    let turning = if limits.revolution_threshold > 0.0 { axis_steps(fit) } else { 0 };
-    let mirroring = if limits.reflection_threshold > 0.0 { mirror_steps(fit) } else { 0 };
-    let total = turning + mirroring;
-    watch.report(Stage::Symmetry, [0, total], None, None)?;
-    let mut report = |done: usize, stopped: &mut Result<(), Error>| -> ControlFlow<()> {
-        *stopped = watch.report(Stage::Symmetry, [done, total], None, None);
-        flow(stopped)
-    };
-    let shown = scene.network_views();
-    let (mut axis, mut mirror, mut stopped) = (None, None, Ok(()));
-    if turning > 0 {
-        axis = find_axis(&shown, own, fit, limits.revolution_threshold, 0, |done| report(done, &mut stopped)).lift()?;
-        std::mem::replace(&mut stopped, Ok(()))?;
+    let shown = &scene.network_views();
+    // Beside each other: many small pieces of work that follow one another fill each other's gaps.
+    let mut jobs: Vec<(usize, Job<'_>)> = Vec::new();
+    if limits.revolution_threshold > 0.0 {
+        let find =
+            |tell: &mut Tell<'_>| find_axis(shown, own, fit, limits.revolution_threshold, 0, tell).map(Found::Axis);
+        jobs.push((axis_steps(fit), Box::new(find)));
     }
-    if mirroring > 0 {
-        let report = |done| report(turning + done, &mut stopped);
-        mirror = find_mirror(&shown, own, fit, limits.reflection_threshold, 0, report).lift()?;
-        stopped?;
+    if limits.reflection_threshold > 0.0 {
+        let find =
+            |tell: &mut Tell<'_>| find_mirror(shown, own, fit, limits.reflection_threshold, 0, tell).map(Found::Mirror);
+        jobs.push((mirror_steps(fit), Box::new(find)));
+    }
+    let total = jobs.iter().map(|(steps, _)| steps).sum();
+    watch.report(Stage::Symmetry, [0, total], None, None)?;
+    let (mut done, mut stopped) = (vec![0; jobs.len()], Ok(()));
+    let results = side_by_side(jobs.into_iter().map(|(_, job)| job).collect(), |job, steps| {
+        done[job] = steps;
+        stopped = watch.report(Stage::Symmetry, [done.iter().sum(), total], None, None);
+        flow(&stopped)
+    });
+    stopped?;
+    let (mut axis, mut mirror) = (None, None);
+    for result in results {
+        match result.lift()? {
+            Found::Axis(found) => axis = found,
+            Found::Mirror(found) => mirror = found,
+        }
     }
     watch.report(Stage::Symmetry, [total, total], None, None)?;
     let mut found = Symmetry::default();
