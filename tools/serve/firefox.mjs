@@ -102,10 +102,20 @@ try {
   await evaluate("document.querySelector('#tools button').focus()");
   await page.key("\uE014");
   check("a toolbar by keys", await evaluate("document.activeElement.dataset.do") === "right", "an arrow key moves");
+  // A mask is edited, enlarged and by keys.
+  await click("#photos li:nth-child(2) button:not(.look)");
+  await until("document.getElementById('brush').open");
+  await click("#paint-closer");
+  await evaluate("document.getElementById('paint').focus()");
+  await page.key(" ");
+  await until("!document.getElementById('paint-undo').disabled");
+  await click("#paint-save");
+  await until("document.querySelector('#photos li:nth-child(2)').textContent.includes('edited')");
+  check("an edited mask", true, await evaluate("document.querySelector('#photos li:nth-child(2) .small').textContent"));
   // Few steps: the page is checked, not the result.
-  await evaluate("Object.assign(document.getElementById('iterations'), { value: 60 }) && true");
+  await evaluate("Object.assign(document.getElementById('iterations'), { value: 60 }) && (document.getElementById('quality').value = 'draft')");
   await click("#go");
-  await until("Number(document.body.dataset.estimates) > 0 && window.viewers[0].count > 0", 120);
+  await until("Number(document.body.dataset.estimates) > 0 && window.viewers[0].count > 0", 300);
   await until("document.body.dataset.state === 'done'", 600);
   await until("document.body.dataset.result && document.querySelectorAll('#downloads a').length > 5");
   check("a result", await evaluate("window.viewers[0].count") > 0, `${await evaluate("window.viewers[0].count")} Gaussians`);
@@ -115,6 +125,12 @@ try {
     await evaluate("(window.viewers.forEach((v) => v.draw()), true)");
     writeFileSync(join(pictures, "firefox.jpg"), await page.picture());
   }
+  // A turntable as a GIF.
+  await evaluate("(() => { const make = URL.createObjectURL; window.blobs = []; URL.createObjectURL = (blob) => (window.blobs.push(blob), make.call(URL, blob)); HTMLAnchorElement.prototype.click = function () {}; return true; })()");
+  await click("#gif");
+  await until("window.blobs.length === 1", 120);
+  const [width, height] = await evaluate("createImageBitmap(window.blobs[0]).then((i) => [i.width, i.height])");
+  check("turntable as a GIF", width === 360 && height === 270, `${width} x ${height}, ${await evaluate("window.blobs[0].size")} bytes`);
   await click("#remove");
   await click("#remove-yes");
   await until("document.activeElement.id === 'undo'");
