@@ -6,7 +6,7 @@
 mod common;
 
 use std::{
-    collections::BTreeSet,
+    collections::{BTreeMap, BTreeSet},
     env, fs,
     io::{BufRead, BufReader, Read, Write},
     net::{SocketAddr, TcpStream},
@@ -78,6 +78,10 @@ fn resident(pid: u32) -> Option<u64> {
     line.trim().trim_end_matches(" kB").parse::<u64>().ok().map(|kb| kb >> 10)
 }
 
+fn descriptors(pid: u32) -> Option<usize> {
+    fs::read_dir(format!("/proc/{pid}/fd")).ok().map(Iterator::count)
+}
+
 #[test]
 #[ignore = "minutes"]
 fn many_jobs_survive_two_kills() {
@@ -88,6 +92,8 @@ fn many_jobs_survive_two_kills() {
     let (next, ended) = (AtomicUsize::new(0), AtomicUsize::new(0));
     let done: Mutex<BTreeSet<String>> = Mutex::default();
     let memory: Mutex<Vec<(u64, u64)>> = Mutex::default();
+    // What each hostile input was answered, and how often.
+    let answers: Mutex<BTreeMap<(&str, u16), usize>> = Mutex::default();
     let kind = format!("multipart/form-data; boundary={BOUNDARY}");
     let begin = Instant::now();
     let client = || {
@@ -110,6 +116,8 @@ fn many_jobs_survive_two_kills() {
                     Some((429 | 503, _)) | None => thread::sleep(Duration::from_millis(50)),
                     Some((status, _)) => {
                         assert!(n % 3 == 2 && (400..500).contains(&status), "{status}");
+                        let which = ["a cut photo", "a large image", "a path outside"][n / 3 % 3];
+                        *answers.lock().unwrap().entry((which, status)).or_default() += 1;
                         break None;
                     }
                 }
@@ -165,7 +173,16 @@ fn many_jobs_survive_two_kills() {
     assert!(all.iter().all(idle), "somebody still waits");
     assert!(files(keep.path()).iter().all(|f| !f.contains("upload")), "no upload is left");
     let memory = memory.into_inner().unwrap();
+    let states = all.iter().fold(BTreeMap::<_, usize>::new(), |mut counts, j| {
+        *counts.entry(j["state"].as_str().unwrap_or_default()).or_default() += 1;
+        counts
+    });
     println!("{} jobs, {} done, {:?}\nseconds and MB: {memory:?}", jobs, done.len(), begin.elapsed());
+    println!("{states:?}\nhostile: {:?}", answers.into_inner().unwrap());
+    // All clients have gone: what is open is the server's own.
+    let open = descriptors(child.lock().unwrap().id());
+    println!("{open:?} descriptors");
+    assert!(open.is_none_or(|n| n < 40), "{open:?} descriptors");
     let most = memory.iter().map(|m| m.1).max().unwrap_or(0);
     assert!(most < 400, "{most} MB");
     let mut child = child.into_inner().unwrap();
