@@ -5,6 +5,9 @@
 /// Pixels, or Gaussians, that one vector step handles: one AVX-512 register, two of AVX2, four of NEON.
 pub const LANES: usize = 16;
 
+/// A number for each pixel of a block, or for each of as many Gaussians.
+pub type Pixels = [f32; LANES];
+
 /// `a * b + c`.
 #[inline(always)]
 pub fn fma<const FMA: bool>(a: f32, b: f32, c: f32) -> f32 {

@@ -3,9 +3,8 @@
 //! [`plain`] says what they are. On x86-64 the same sums are made with AVX2, in another order: eight of them at once by a
 //! tree of additions of halves of vectors, which the compiler does not find by itself.
 
-use super::math::LANES;
+use super::math::{LANES, Pixels};
 use super::project::SUMS;
-use super::tile::Pixels;
 
 /// What is summed.
 #[derive(Default)]

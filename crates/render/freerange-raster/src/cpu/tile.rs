@@ -4,7 +4,7 @@
 //! instruction sets (see `mod.rs`), with loops over lanes that have no branches.
 
 use super::bin::{BAND, BLOCK, CHUNK, Chunk, Lists, blocks_across};
-use super::math::{LANES, exp2, fma, min};
+use super::math::{LANES, Pixels, exp2, fma, min};
 use super::project::{LOG2_255, SUMS, Splat};
 use super::sums;
 
@@ -14,9 +14,6 @@ pub const MIN_TRANSMITTANCE: f32 = 1e-4;
 pub const MAX_ALPHA: f32 = 0.99;
 /// How often, in splats, a block is checked for having become opaque.
 const CHECK: usize = 8;
-
-/// A number for each pixel of a block.
-pub type Pixels = [f32; LANES];
 
 /// Pixel center of each lane, from the corner of its block.
 const X: Pixels = lanes(0, 0.5);
