@@ -180,6 +180,7 @@ class Model:
             Ks: the same as `intrinsics`.
             convention: "opengl" for OpenGL's and Blender's axes (y up, z backward).
             up: which way is up in the cameras' frame: "z", "y", "cameras" or a direction.
+                COLMAP's frames have no upright z: pass "cameras", or a `Scene` to `reconstruct_scene`.
             center, radius: where the object is, if that is known.
             seed: a number, or several for a list of as many samples.
             quality: "draft", "default" or "high"; the options that follow are the preset's if they are None.

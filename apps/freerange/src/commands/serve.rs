@@ -148,7 +148,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         Some(path) => path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned(),
         None => "the shipped model".into(),
     };
-    let name = format!("{place} on {}", args.pipeline.device);
+    let name = format!("{place} on {device}");
     let engine = Local { model, pipeline: args.pipeline.clone(), name, finder };
     let server = Server::bind(&config, Arc::new(engine))?;
     let stopper = server.stopper();

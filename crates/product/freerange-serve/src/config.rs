@@ -40,7 +40,7 @@ pub struct Example {
 pub struct Limits {
     /// Bytes of all files of a job.
     pub bytes: u64,
-    /// Bytes of one file.
+    /// Bytes of one file; a file of Gaussians may have as many as a job.
     pub file_bytes: u64,
     /// Files of a job.
     pub files: usize,
@@ -142,8 +142,11 @@ impl ServeConfig {
                 if token.len() < TOKEN || !token.bytes().all(|b| b.is_ascii_alphanumeric() || b"-._~".contains(&b)) =>
             {
                 // Secrets do not belong into messages.
-                let found = format!("{} characters", token.chars().count());
-                refuse("token", format!("{TOKEN} letters, digits or - . _ ~, or more"), found)
+                let found = match token.chars().count() {
+                    few if few < TOKEN => format!("{few} characters"),
+                    _ => "other characters among them".into(),
+                };
+                refuse("token", format!("{TOKEN} or more letters, digits or - . _ ~"), found)
             }
             _ => Ok(()),
         }?;

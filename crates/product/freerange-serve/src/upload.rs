@@ -134,7 +134,12 @@ impl<'a> Upload<'a> {
         let mut writer = BufWriter::new(file);
         let mut size = 0u64;
         let is_json = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("json"));
-        let most = if is_json { JSON.min(self.limits.file_bytes) } else { self.limits.file_bytes };
+        let most = match kind {
+            _ if is_json => JSON.min(self.limits.file_bytes),
+            // It is the whole job.
+            Kind::Splats => self.limits.bytes,
+            _ => self.limits.file_bytes,
+        };
         loop {
             let n = read(&mut chunk)?;
             if n == 0 {

@@ -14,6 +14,7 @@
 //! The result goes back to the user's frame.
 
 mod canonical;
+mod complete;
 mod optimize;
 mod propose;
 mod refine;

@@ -15,7 +15,8 @@ use crate::{
 };
 
 /// What the page says where no engine is there.
-const MISSING: &str = "this server cannot find cameras: neither COLMAP nor pycolmap is installed on it";
+const MISSING: &str = "this server cannot find cameras, since neither COLMAP nor pycolmap is installed on it: send a file of \
+                       cameras too, or fill in Turntable for photos of one even turn";
 
 /// An engine that finds cameras, looked for once.
 #[derive(Default)]

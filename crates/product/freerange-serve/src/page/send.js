@@ -48,7 +48,7 @@ const chosenOf = (picked) => {
   const limits = app.limits, bytes = fine.reduce((sum, { file }) => sum + file.size, 0);
   if (limits && fine.length > limits.files) throw new Error(`these are ${fine.length} files: this server takes at most ${limits.files}`);
   if (limits && bytes > limits.bytes) throw new Error(`these files have ${megabytes(bytes)}: this server takes at most ${megabytes(limits.bytes)}`);
-  const large = limits && fine.find(({ file }) => file.size > limits.file_bytes);
+  const large = limits && fine.find(({ file, path }) => file.size > limits.file_bytes && !SPLATS.test(path));
   if (large) throw new Error(`${large.path} has ${megabytes(large.file.size)}: this server takes at most ${megabytes(limits.file_bytes)} a file`);
   return { fine, left: others.map(({ path }) => path), bytes };
 };

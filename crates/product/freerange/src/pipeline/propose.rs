@@ -1,5 +1,6 @@
 //! Step 3, propose. In: targets in the canonical frame. Out: `propose.count` sets of Gaussians in it, each from a seed of its
-//! own: initial fits of any number of Gaussians, samples of the learned flow (paper, Section 3.6), or the user's own.
+//! own: initial fits of any number of Gaussians, samples of the learned flow (paper, Section 3.6), or the user's own,
+//! [completed](super::complete) by an initial fit.
 //!
 //! Initial fits take a second of two cores together; a sample of the flow takes 50 evaluations of the network, or 100 with
 //! classifier-free guidance.
@@ -9,10 +10,12 @@ use std::ops::ControlFlow;
 use freerange_diffusion::sample::FlowSampler;
 use freerange_gaussians::Gaussians;
 use freerange_optim::initial_fit;
-use freerange_util::side_by_side;
+use freerange_util::{Note, side_by_side};
 
 use super::{
-    CanonicalScene, refine,
+    CanonicalScene,
+    complete::completed,
+    refine,
     symmetry::Targets,
     watch::{Watch, flow},
 };
@@ -32,14 +35,20 @@ pub(crate) fn propose(
 ) -> Result<Vec<Gaussians>, Error> {
     let config = &options.pipeline.propose;
     if let Some(init) = &options.init {
-        watch.report(Stage::Propose, [0, 1], None, None)?;
+        let own = scene.user_proposal(init)?;
+        let fit = fits(scene, targets, options, [seed, 1], watch)?.remove(0);
+        let before = own.len();
+        let all = completed(own, &fit);
+        let added = all.len() - before;
+        if added > 0 && watch.sample == 0 {
+            let text = format!("{added} Gaussians of an initial fit are added where the file has none");
+            scene.notes.push(Note::understood(text));
+        }
         // The network refines equal proposals equally: one is enough.
-        let own = vec![scene.user_proposal(init)?];
-        watch.report(Stage::Propose, [1, 1], None, None)?;
-        return Ok(own);
+        return Ok(vec![all]);
     }
     match config.init {
-        Init::Fit => fits(scene, targets, options, seed, watch),
+        Init::Fit => fits(scene, targets, options, [seed, config.count as u64], watch),
         Init::Flow => {
             let flow = &config.flow;
             let sampler = FlowSampler { checkpoint: model.checkpoint(), config: flow, device: &model.device().0 };
@@ -54,16 +63,16 @@ pub(crate) fn propose(
     }
 }
 
-/// Initial fits, beside each other.
+/// As many initial fits, beside each other.
 fn fits(
     scene: &CanonicalScene,
     targets: &Targets,
     options: &Options,
-    seed: u64,
+    [seed, count]: [u64; 2],
     watch: &mut Watch<'_>,
 ) -> Result<Vec<Gaussians>, Error> {
     let config = &options.pipeline.propose;
-    let numbers: Vec<u64> = (0..config.count as u64).map(|i| seed.wrapping_mul(MOST).wrapping_add(i)).collect();
+    let numbers: Vec<u64> = (0..count).map(|i| seed.wrapping_mul(MOST).wrapping_add(i)).collect();
     // The fit that found the object's place is that of number 0.
     let known = |number: u64| scene.fit.as_ref().filter(|_| number == 0);
     let total = numbers.iter().filter(|n| known(**n).is_none()).count() * config.fit.iterations;

@@ -213,7 +213,9 @@ pub fn nearest_point(lines: &[(DVec3, DVec3)]) -> Result<DVec3, CameraError> {
     let point = middle + normal.inverse() * right;
     if lines.iter().any(|(o, d)| (point - *o).dot(*d) <= 0.0) {
         return Err(CameraError::Frame(
-            "the cameras do not look at one common point; are the poses camera-to-world with OpenGL axes?".into(),
+            "the cameras do not look at one common point in front of them; are the poses camera to world, and the axes right \
+             (OpenGL's in transforms.json; in Python those of `convention`)?"
+                .into(),
         ));
     }
     Ok(point)
