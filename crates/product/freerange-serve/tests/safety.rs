@@ -103,7 +103,14 @@ fn beyond_loopback_a_token_is_needed() {
     let refused = |config: &ServeConfig| Server::bind(config, Fake::quick()).err().unwrap().to_string();
     assert!(refused(&config).starts_with("token: expected one") && refused(&config).contains("--no-token"));
     let short = refused(&ServeConfig { token: Some("secret".into()), ..config.clone() });
-    assert!(short.starts_with("token: expected 16 letters") && !short.contains("secret"), "{short}");
+    assert!(
+        short.starts_with("token: expected 16 or more letters")
+            && short.contains("6 characters")
+            && !short.contains("secret"),
+        "{short}"
+    );
+    let odd = refused(&ServeConfig { token: Some("abc+def/ghi=jklmnop".into()), ..config.clone() });
+    assert!(odd.contains("other characters") && !odd.contains("abc"), "{odd}");
     assert!(
         refused(&ServeConfig { names: vec!["a:80".into()], token: Some(TOKEN.into()), ..config.clone() })
             .contains("--name")

@@ -1,11 +1,15 @@
-//! What a user's file of Gaussians lacks. In: the file and an initial fit, both in the canonical frame. Out: the file, and those
-//! Gaussians of the fit that lie where the file has none.
+//! What a user's file of Gaussians lacks. In: the file and an initial fit, both in the canonical frame, and the photos. Out: the
+//! file, and those Gaussians of the fit that stand where photos show the object and the file does not.
 //!
-//! A fit that others made of few photos, or a part of an object, is a poor proposal by itself: the network corrects what is
-//! there, and does not fill what is missing (docs/research/experiments/initial-fits.md).
+//! A part of an object is a poor proposal by itself: the network corrects what is there, and does not fill what is missing
+//! (docs/research/experiments/initial-fits.md).
 
 use freerange_gaussians::{Gaussians, channel};
+use freerange_raster::{RasterConfig, render};
+use freerange_scene::camera::View;
 use glam::DVec3;
+
+use crate::{Error, error::Lift};
 
 /// Cells along each side of the cube in which places are compared, and half of that side: the object has a radius of 0.5.
 const CELLS: usize = 40;
@@ -13,9 +17,36 @@ const HALF: f64 = 0.6;
 /// Fainter Gaussians fill no place.
 const FAINT: f32 = 0.1;
 
-/// `own`, and after it the Gaussians of `fit` whose place is empty: no Gaussian of `own` lies in the same cell or in one beside
-/// it. Cells are 0.03 wide.
-pub(super) fn completed(own: Gaussians, fit: &Gaussians) -> Gaussians {
+/// `own`, and after it those Gaussians of `fit` that
+/// - at least one photo shows at a pixel of the object at which `own` lets more than half of the light through, and
+/// - have no Gaussian of `own` in their cell or in one beside it. Cells are 0.03 wide.
+///
+/// # Errors
+/// If a camera cannot be rendered from.
+pub(super) fn completed(own: Gaussians, fit: &Gaussians, photos: &[View]) -> Result<Gaussians, Error> {
+    let filled = filled(&own);
+    let mut wanted = vec![false; fit.len()];
+    for photo in photos {
+        let camera = &photo.camera;
+        let shown = render(own.rows(), &[*camera], &[[0.0; 3]], &RasterConfig::default()).lift()?;
+        let missing = |pixel: usize, alpha: u8| alpha >= 128 && shown.alpha[pixel] < 0.5;
+        for (i, wanted) in wanted.iter_mut().enumerate() {
+            let p = camera.world_to_camera.transform_point3(fit.mean(i));
+            let (x, y) = (camera.fx * p.x / p.z + camera.cx, camera.fy * p.y / p.z + camera.cy);
+            // Phrased so that NaN fails it.
+            if p.z > 0.0 && x >= 0.0 && y >= 0.0 && x < f64::from(camera.width) && y < f64::from(camera.height) {
+                let (x, y) = (x as u32, y as u32);
+                *wanted |= missing((y * camera.width + x) as usize, photo.image.get_pixel(x, y).0[3]);
+            }
+        }
+    }
+    let empty = |i: &usize| wanted[*i] && cell(fit.mean(*i)).is_some_and(|at| !filled[index(at)]);
+    let added = fit.select((0..fit.len()).filter(empty));
+    Ok(Gaussians::from_rows(own.rows().iter().chain(added.rows()).copied().collect()))
+}
+
+/// Cells with a Gaussian, and those beside them.
+fn filled(own: &Gaussians) -> Vec<bool> {
     let mut filled = vec![false; CELLS.pow(3)];
     let faint = (FAINT / (1.0 - FAINT)).ln();
     for (i, row) in own.iter().enumerate() {
@@ -23,13 +54,11 @@ pub(super) fn completed(own: Gaussians, fit: &Gaussians) -> Gaussians {
         let beside = |at: usize| at.saturating_sub(1)..(at + 2).min(CELLS);
         for x in beside(x) {
             for y in beside(y) {
-                beside(z).for_each(|z| filled[(x * CELLS + y) * CELLS + z] = true);
+                beside(z).for_each(|z| filled[index([x, y, z])] = true);
             }
         }
     }
-    let empty = |i: &usize| cell(fit.mean(*i)).is_some_and(|[x, y, z]| !filled[(x * CELLS + y) * CELLS + z]);
-    let added = fit.select((0..fit.len()).filter(empty));
-    Gaussians::from_rows(own.rows().iter().chain(added.rows()).copied().collect())
+    filled
 }
 
 /// The cell of a point; none outside of the cube.
@@ -39,8 +68,15 @@ fn cell(point: DVec3) -> Option<[usize; 3]> {
     within.then(|| at.to_array().map(|v| v as usize))
 }
 
+fn index([x, y, z]: [usize; 3]) -> usize {
+    (x * CELLS + y) * CELLS + z
+}
+
 #[cfg(test)]
 mod tests {
+    use freerange_scene::camera::Camera;
+    use image::{Rgba, RgbaImage};
+
     use super::*;
 
     fn at(points: &[[f32; 3]], logit: f32) -> Gaussians {
@@ -48,6 +84,7 @@ mod tests {
         for point in points {
             let mut row = [0.0; channel::COUNT];
             row[channel::MEAN].copy_from_slice(point);
+            row[channel::LOG_SCALE].fill(-3.0);
             row[channel::ROTATION.start] = 1.0;
             row[channel::LOGIT_OPACITY] = logit;
             all.push(&row);
@@ -55,17 +92,35 @@ mod tests {
         all
     }
 
+    /// A photo along y, of an object that fills `of` of its columns.
+    fn photo(of: std::ops::Range<u32>) -> View {
+        let camera = Camera::look_at(DVec3::new(0.0, -1.5, 0.0), DVec3::ZERO, DVec3::Z, 0.9, 64, 64);
+        let image = RgbaImage::from_fn(64, 64, |x, _| Rgba([200, 200, 200, if of.contains(&x) { 255 } else { 0 }]));
+        View { name: "photo".into(), camera, image }
+    }
+
     #[test]
-    fn a_fit_is_added_where_the_file_has_none() {
+    fn a_fit_is_added_where_photos_show_what_the_file_lacks() {
+        let all = photo(0..64);
         let fit = at(&[[0.2, 0.0, 0.0], [0.22, 0.01, 0.0], [-0.2, 0.0, 0.0], [0.9, 0.0, 0.0]], 1.0);
         let own = at(&[[0.21, 0.0, 0.0]], 3.0);
-        let all = completed(own.clone(), &fit);
-        assert_eq!(all.len(), 2);
-        assert_eq!((all.mean(0), all.mean(1)), (own.mean(0), fit.mean(2)), "the file first; nothing far outside");
+        let more = completed(own.clone(), &fit, std::slice::from_ref(&all)).unwrap();
+        assert_eq!(more.len(), 2);
+        assert_eq!((more.mean(0), more.mean(1)), (own.mean(0), fit.mean(2)), "the file first; nothing far outside");
+        let count = |own: &Gaussians, photos: &[View]| completed(own.clone(), &fit, photos).unwrap().len() - own.len();
         // What nobody sees fills nothing.
-        assert_eq!(completed(at(&[[0.21, 0.0, 0.0]], -5.0), &fit).len(), 4);
-        assert_eq!(completed(own.clone(), &at(&[], 0.0)), own);
-        // At the cube's rim there are fewer cells beside.
-        assert_eq!(completed(at(&[[-0.599, 0.599, 0.0]], 1.0), &fit).len(), 4);
+        assert_eq!(count(&at(&[[0.21, 0.0, 0.0]], -5.0), std::slice::from_ref(&all)), 3);
+        // Only the object is completed, and only what a photo shows.
+        assert_eq!(count(&own, &[photo(32..64)]), 0);
+        assert_eq!(count(&own, &[photo(32..64), all]), 1);
+        assert_eq!(count(&own, &[]), 0);
+    }
+
+    #[test]
+    fn behind_what_the_file_shows_nothing_is_missing() {
+        let wall: Vec<[f32; 3]> =
+            (0..400).map(|i| [(i % 20) as f32 * 0.04 - 0.38, -0.3, (i / 20) as f32 * 0.04 - 0.38]).collect();
+        let (own, fit) = (at(&wall, 5.0), at(&[[0.0, 0.2, 0.0]], 1.0));
+        assert_eq!(completed(own, &fit, &[photo(0..64)]).unwrap().len(), 400);
     }
 }

@@ -38,7 +38,7 @@ pub(crate) fn propose(
         let own = scene.user_proposal(init)?;
         let fit = fits(scene, targets, options, [seed, 1], watch)?.remove(0);
         let before = own.len();
-        let all = completed(own, &fit);
+        let all = completed(own, &fit, targets.network_views())?;
         let added = all.len() - before;
         if added > 0 && watch.sample == 0 {
             let text = format!("{added} Gaussians of an initial fit are added where the file has none");
