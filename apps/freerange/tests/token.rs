@@ -75,7 +75,7 @@ fn what_is_not_safe_is_refused() {
     let short = short.to_str().unwrap();
     let cases: [(&[&str], &str); 5] = [
         (&["--host", "0.0.0.0", "--no-token"], "--no-token"),
-        (&["--token-file", short], "16 letters"),
+        (&["--token-file", short], "16 or more letters"),
         (&["--token-file", "/nowhere/token"], "/nowhere/token"),
         (&["--token-file", short, "--no-token"], "cannot be used with"),
         (&["--token", TOKEN], "unexpected argument"),
