@@ -22,6 +22,7 @@ pub(crate) struct Anchors {
     pictures: Vec<Picture>,
     raster: RasterConfig,
     weight: f64,
+    every: usize,
 }
 
 struct Picture {
@@ -61,7 +62,13 @@ impl Anchors {
         let wanted = if config.weight > 0.0 { usize::MAX } else { 0 };
         let cameras = around(config.views, config.size, config.radius);
         let pictures = cameras.take(wanted).map(picture).collect::<Result<_, FitError>>()?;
-        Ok(Self { pictures, raster, weight: config.weight })
+        let (weight, every) = (config.weight * config.every as f64, config.every);
+        Ok(Self { pictures, raster, weight, every })
+    }
+
+    /// Whether step number `step` looks at one of them.
+    pub fn due(&self, step: usize) -> bool {
+        step % self.every == 1 % self.every
     }
 
     /// Number of pictures.
@@ -69,7 +76,7 @@ impl Anchors {
         self.pictures.len()
     }
 
-    /// The mean absolute difference between picture `view` and `cloud`, both over `background`, times the weight.
+    /// The mean absolute difference between picture `view` and `cloud`, both over `background`, times the weight of the steps that look at one.
     pub fn objective(&self, cloud: &Gaussians, view: usize, background: [f32; 3]) -> Result<Objective, FitError> {
         let Picture { camera, rgb, alpha } = &self.pictures[view];
         let out = render(cloud.rows(), &[*camera], &[background], &self.raster)?;

@@ -8,7 +8,7 @@ use glam::{DMat4, DVec3};
 
 use crate::{
     Evidence, FitError, InitialFitConfig, Silhouette,
-    search::{Hull, OUTLINE, PICTURE, ROUNDS, Search, Symmetry, UNCOVERED, difference, going_on, normals, place},
+    search::{Hull, OUTLINE, PICTURE, Pictures, ROUNDS, Search, Symmetry, UNCOVERED, going_on, normals, place},
     views::Targets,
 };
 
@@ -113,15 +113,18 @@ pub fn find_axis(
     let Some(mut judged) = search.each(axes, |axis| Ok((uncovered(&axis)?, axis)))? else { return Ok(None) };
     judged.sort_by(|a, b| a.0.total_cmp(&b.0));
     let judged: Vec<Axis> = judged.into_iter().take(PLACED).map(|(_, axis)| axis).collect();
-    let Some(placed) = search.each(judged, |axis| place(axis, [0.12, 0.012], uncovered))? else { return Ok(None) };
+    let Some(placed) = search.each(judged, |axis| place(axis, [0.12, 0.012], |axis, _| uncovered(axis)))? else {
+        return Ok(None);
+    };
     let best = placed.into_iter().min_by(|a, b| a.0.total_cmp(&b.0));
     let Some((_, mut axis)) = best.filter(|(uncovered, _)| *uncovered <= UNCOVERED) else { return Ok(None) };
 
     let pictures = Targets::new(views, Some(PICTURE))?;
+    let (outlines, pictures) = (Pictures::new(&silhouettes, false), Pictures::new(&pictures, false));
     let put = |cloud: &Gaussians, axis: Axis, reach| {
-        place(axis, reach, |axis| difference(cloud, &silhouettes, Some(axis), false))
+        place(axis, reach, |axis, enough| outlines.difference(cloud, Some(axis), enough))
     };
-    let before = difference::<Axis>(own, &pictures, None, false)?;
+    let before = pictures.difference::<Axis>(own, None, f64::INFINITY)?;
     (_, axis) = put(own, axis, [0.04, 0.004])?;
     let both = Evidence { views, silhouettes: turned(views, &axis) };
     let Some(mut cloud) = search.fitted(None, both, config)? else { return Ok(None) };
@@ -131,7 +134,7 @@ pub fn find_axis(
         let Some(next) = search.fitted(Some(&cloud), both, &going_on(config))? else { return Ok(None) };
         cloud = next;
     }
-    let contradiction = difference::<Axis>(&cloud, &pictures, None, false)? / before.max(f64::MIN_POSITIVE);
+    let contradiction = pictures.difference::<Axis>(&cloud, None, f64::INFINITY)? / before.max(f64::MIN_POSITIVE);
     Ok((contradiction <= most).then_some(FoundAxis { axis, contradiction }))
 }
 

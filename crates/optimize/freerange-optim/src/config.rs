@@ -105,7 +105,7 @@ impl Default for FitConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct OptimizationConfig {
-    /// Optimization steps; each one looks at one view, and at one anchor render.
+    /// Optimization steps; each one looks at one view, and every so many at an anchor render.
     pub steps: usize,
     /// Number of Gaussians at the end; a cloud that has more keeps its number.
     pub gaussians: usize,
@@ -125,6 +125,8 @@ pub struct OptimizationConfig {
     pub coarse: f64,
     /// Longest side in pixels at which these steps compare views. Smaller views are compared as they are.
     pub coarse_size: u32,
+    /// Part of each side of a view that the steps after these compare: a window about a random point of the object. 1: all of it. 0..1
+    pub window: f64,
     /// What keeps the cloud where no view looks.
     pub anchors: AnchorConfig,
     /// Seed of everything drawn.
@@ -144,6 +146,7 @@ impl Default for OptimizationConfig {
             render_size: Some(256),
             coarse: 0.0,
             coarse_size: 256,
+            window: 1.0,
             anchors: AnchorConfig::default(),
             seed: 0,
         }
@@ -161,13 +164,15 @@ pub struct AnchorConfig {
     pub views: usize,
     /// Their width and height in pixels.
     pub size: u32,
+    /// Every so many steps one of them is looked at, with as many times the weight.
+    pub every: usize,
     /// Radius of the sphere around the origin that they show. World units.
     pub radius: f64,
 }
 
 impl Default for AnchorConfig {
     fn default() -> Self {
-        Self { weight: 0.1, views: 12, size: 128, radius: 0.5 }
+        Self { weight: 0.1, views: 12, size: 96, every: 2, radius: 0.5 }
     }
 }
 
@@ -251,8 +256,13 @@ const MOST_PHOTOS: usize = 16;
 /// Up to so many pixels, the longest side, pictures grow with the number of photos.
 const MOST_GROWN: u32 = 512;
 
-/// What [`OptimizationConfig::coarse`] is where detail is asked for: a third less time, and the same in the end.
+/// What [`OptimizationConfig::coarse`] and [`OptimizationConfig::window`] are where detail is asked for: half the time, and the
+/// same in the end.
 const COARSE: f64 = 0.6;
+const WINDOW: f64 = 0.6;
+
+/// So many times as much anchors weigh beside windows, in which the object's pixels count for more than in whole views.
+const BESIDE_WINDOWS: f64 = 1.5;
 
 impl OptimizationConfig {
     /// These settings, which are for up to four photos, for so many: as many steps for each, more of their pixels, up to 512, and less weight of
@@ -286,8 +296,9 @@ impl OptimizationConfig {
             gaussians: self.gaussians.saturating_mul(detail),
             render_size: self.render_size.map(grown),
             coarse: COARSE,
+            window: WINDOW,
             coarse_size: (grown(self.coarse_size) / 2).max(1),
-            anchors: AnchorConfig { weight: self.anchors.weight / detail as f64, ..self.anchors },
+            anchors: AnchorConfig { weight: BESIDE_WINDOWS * self.anchors.weight / detail as f64, ..self.anchors },
             ..self
         }
     }
@@ -303,6 +314,7 @@ impl OptimizationConfig {
         fraction("lambda_ssim", self.lambda_ssim)?;
         check_render_size(self.render_size)?;
         fraction("coarse", self.coarse)?;
+        check("window", "a number above 0, at most 1", self.window, self.window > 0.0 && self.window <= 1.0)?;
         check("coarse_size", "at least 1 pixel", self.coarse_size, self.coarse_size > 0)?;
         self.anchors.check()
     }
@@ -339,6 +351,7 @@ impl AnchorConfig {
         finite_not_negative("anchors.weight", self.weight)?;
         check("anchors.views", "1 to 1000", self.views, (1..=1000).contains(&self.views))?;
         check("anchors.size", "16 to 1024", self.size, (16..=1024).contains(&self.size))?;
+        at_least_one("anchors.every", self.every)?;
         positive("anchors.radius", self.radius)
     }
 }
@@ -375,11 +388,14 @@ mod tests {
             assert_eq!(config.clone().detailed(detail, 4000), config);
         }
         let two = config.clone().detailed(2, 512);
-        assert_eq!((two.steps, two.gaussians, two.render_size, two.anchors.weight), (500, 16_384, Some(512), 0.05));
-        assert_eq!((two.coarse, two.coarse_size), (0.6, 256));
+        assert_eq!(
+            (two.steps, two.gaussians, two.render_size, two.anchors.weight),
+            (500, 16_384, Some(512), 1.5 * 0.1 / 2.0)
+        );
+        assert_eq!((two.coarse, two.coarse_size, two.window), (0.6, 256, 0.6));
         let four = config.clone().detailed(4, 4000);
         assert_eq!((four.steps, four.gaussians, four.render_size, four.coarse_size), (1000, 32_768, Some(1024), 512));
-        assert_eq!(four.anchors.weight, 0.025);
+        assert_eq!(four.anchors.weight, 1.5 * 0.1 / 4.0);
         four.check().unwrap();
         // No more than photos show.
         assert_eq!(config.clone().detailed(4, 512), two);
@@ -432,9 +448,12 @@ mod tests {
         refused(&|c| c.final_mean_rate = f64::NAN, "final_mean_rate");
         refused(&|c| c.coarse = 1.5, "coarse");
         refused(&|c| c.coarse_size = 0, "coarse_size");
+        refused(&|c| c.window = 0.0, "window");
+        refused(&|c| c.window = f64::NAN, "window");
         refused(&|c| c.anchors.weight = -1.0, "anchors.weight");
         refused(&|c| c.anchors.views = 0, "anchors.views");
         refused(&|c| c.anchors.size = 8, "anchors.size");
+        refused(&|c| c.anchors.every = 0, "anchors.every");
         refused(&|c| c.anchors.radius = f64::INFINITY, "anchors.radius");
     }
 

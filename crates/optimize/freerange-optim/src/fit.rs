@@ -36,22 +36,26 @@ pub fn fit<'a>(
         Some(cloud) => checked(cloud, config.cap_max)?,
         None => random_cloud(&targets, config, &mut rng),
     };
-    descend(cloud, |_| &targets, config, &mut rng, |_, _| Ok(Vec::new()), progress)
+    descend(cloud, |_| (&targets, 1.0), config, &mut rng, |_, _| Ok(Vec::new()), progress)
 }
 
-/// The optimization itself. `of_step` is what each step compares with, at whatever size; `more` are further terms of the objective of a cloud over a background.
+/// The optimization itself. `of_step` is what each step compares with, at whatever size, and the part of each side of a view
+/// that it looks at ([`OptimizationConfig::window`](crate::OptimizationConfig::window)); `more` are further terms of the objective of a cloud over a background.
 pub(crate) fn descend<'t>(
     mut cloud: Gaussians,
-    of_step: impl Fn(usize) -> &'t Targets,
+    of_step: impl Fn(usize) -> (&'t Targets, f64),
     config: &FitConfig,
     rng: &mut ChaCha8Rng,
     mut more: impl FnMut(&Gaussians, [f32; 3]) -> Result<Vec<Objective>, FitError> + Send,
     mut progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Gaussians, FitError> {
     let mut adam = Adam::default();
+    // A stream of its own: the views come in the same order with and without windows.
+    let mut window_rng = ChaCha8Rng::seed_from_u64(config.seed);
+    window_rng.set_stream(2);
     let (mut queue, mut silhouette_queue) = (Vec::new(), Vec::new());
     for step in 0..config.iterations {
-        let targets = of_step(step);
+        let (targets, window) = of_step(step);
         let silhouettes = targets.cameras.len() - targets.views;
         let done = step as f64 / config.iterations as f64;
         let mean_rate = config.rates.mean * (config.final_mean_rate / config.rates.mean).powf(done);
@@ -65,9 +69,14 @@ pub(crate) fn descend<'t>(
                 false => next_views(&mut queue, targets.views, config.views_per_step, rng),
             };
             let background = config.background.draw(rng);
-            let own = || match by_silhouette {
-                true => Objective::silhouettes(&cloud, targets, &chosen),
-                false => Objective::photometric(&cloud, targets, &chosen, background, config.lambda_ssim),
+            let windows = (window < 1.0 && !by_silhouette).then(|| targets.windows(&chosen, window, &mut window_rng));
+            let own = || match &windows {
+                _ if by_silhouette => Objective::silhouettes(&cloud, targets, &chosen),
+                Some(windows) => {
+                    let all: Vec<usize> = (0..chosen.len()).collect();
+                    Objective::photometric(&cloud, windows, &all, background, config.lambda_ssim)
+                }
+                None => Objective::photometric(&cloud, targets, &chosen, background, config.lambda_ssim),
             };
             let (own, further) = rayon::join(own, || more(&cloud, background));
             let mut objective = own?;

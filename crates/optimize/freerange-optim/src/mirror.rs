@@ -11,7 +11,7 @@ use rayon::prelude::*;
 
 use crate::{
     FitError, InitialFitConfig,
-    search::{Hull, OUTLINE, PICTURE, ROUNDS, Search, Symmetry, UNCOVERED, difference, going_on, normals, place},
+    search::{Hull, OUTLINE, PICTURE, Pictures, ROUNDS, Search, Symmetry, UNCOVERED, going_on, normals, place},
     views::Targets,
 };
 
@@ -122,16 +122,17 @@ pub fn find_mirror(
     config.check()?;
     let silhouettes = Targets::new(views, Some(OUTLINE))?;
     let planes = planes(&Hull::new(&silhouettes), &silhouettes);
-    let pictures = Targets::new(views, Some(PICTURE))?;
+    let targets = Targets::new(views, Some(PICTURE))?;
+    let pictures = Pictures::new(&targets, true);
     let mut search = Search { progress: &mut progress, seed, done: 0 };
     let put = |cloud: &Gaussians, plane: Mirror, reach| {
-        place(plane, [reach, 0.001], |plane| difference(cloud, &pictures, Some(plane), true))
+        place(plane, [reach, 0.001], |plane, enough| pictures.difference(cloud, Some(plane), enough))
     };
-    let judge = |plane: Mirror| Ok((difference(own, &pictures, Some(&plane), true)?, plane));
+    let judge = |plane: Mirror| Ok((pictures.difference(own, Some(&plane), f64::INFINITY)?, plane));
     let Some(judged) = search.each(planes, judge)? else { return Ok(None) };
     let judged: Vec<Mirror> = best(judged, PLACED).into_iter().map(|(_, plane)| plane).collect();
     let Some(placed) = search.each(judged, |plane| put(own, plane, 0.04))? else { return Ok(None) };
-    let before = difference::<Mirror>(own, &pictures, None, true)?;
+    let before = pictures.difference::<Mirror>(own, None, f64::INFINITY)?;
     let fitted = |mut plane: Mirror, tell: &mut dyn FnMut(()) -> ControlFlow<()>| {
         let both = |plane: &Mirror| [views, &mirrored(views, plane)[..]].concat();
         let mut search = Search { progress: &mut |_| tell(()), seed, done: 0 };
@@ -141,8 +142,8 @@ pub fn find_mirror(
             let Some(next) = search.fitted(Some(&cloud), &both(&plane), &going_on(config))? else { return Ok(None) };
             cloud = next;
         }
-        let contradiction = difference::<Mirror>(&cloud, &pictures, None, true)? / before.max(f64::MIN_POSITIVE);
-        let doubt = contradiction - NEW * (1.0 - beside(&pictures, plane.normal));
+        let contradiction = pictures.difference::<Mirror>(&cloud, None, f64::INFINITY)? / before.max(f64::MIN_POSITIVE);
+        let doubt = contradiction - NEW * (1.0 - beside(&targets, plane.normal));
         Ok::<_, FitError>(Some(FoundMirror { mirror: plane, doubt }))
     };
     let fitted = &fitted;
@@ -311,6 +312,22 @@ mod tests {
             let found = beside(&targets, DVec3::new(turn.cos(), turn.sin(), 0.0));
             assert!((found - cosine).abs() < 1e-9, "{turn}: {found}");
         }
+    }
+
+    #[test]
+    fn a_comparison_that_ends_early_changes_no_place() {
+        let cloud = twins(20, 3, &MIRROR);
+        let targets = Targets::new(&photos(&cloud), Some(32)).unwrap();
+        let pictures = Pictures::new(&targets, true);
+        let near = MIRROR.moved(0, 0.05).moved(2, 0.04);
+        let reach = [0.04, 0.001];
+        let whole = place(near, reach, |plane, _| pictures.difference(&cloud, Some(plane), f64::INFINITY)).unwrap();
+        let early = place(near, reach, |plane, enough| pictures.difference(&cloud, Some(plane), enough)).unwrap();
+        assert_eq!(early, whole);
+        assert!(early.1.normal.angle_between(MIRROR.normal) < 0.02, "{early:?}");
+        // It did end early.
+        let part = pictures.difference(&cloud, Some(&near), 0.5 * whole.0).unwrap();
+        assert!(part < pictures.difference(&cloud, Some(&near), f64::INFINITY).unwrap());
     }
 
     #[test]

@@ -151,7 +151,11 @@ fn compare(
     let (x0, y0) = (left.saturating_sub(MARGIN), top.saturating_sub(MARGIN));
     let (x1, y1) = ((right + 1 + MARGIN).min(width), (bottom + 1 + MARGIN).min(height));
     let rows = || (y0..y1).map(|y| 3 * (y * width + x0)..3 * (y * width + x1));
-    let crop = |from: &[f32]| rows().flat_map(|row| from[row].iter().copied()).collect::<Vec<f32>>();
+    let crop = |from: &[f32]| {
+        let mut part = Vec::with_capacity(3 * (x1 - x0) * (y1 - y0));
+        rows().for_each(|row| part.extend_from_slice(&from[row]));
+        part
+    };
     let (loss, part) = photometric_loss(&crop(image), &crop(target), x1 - x0, y1 - y0, lambda_ssim)?;
     // Means over the rectangle, where means over the image are asked for.
     let scale = part.len() as f64 / image.len() as f64;

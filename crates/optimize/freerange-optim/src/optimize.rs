@@ -18,7 +18,7 @@ const SILHOUETTES: u32 = 128;
 /// Improves a cloud's agreement with posed views, and shows more detail by more Gaussians.
 ///
 /// Few views say little of the rest of the object, and Gaussians that only they judge leave the object's surface. Hence
-/// [anchors](crate::AnchorConfig): at every step, a picture of the cloud as it was, from somewhere around the object, is one
+/// [anchors](crate::AnchorConfig): at every other step, a picture of the cloud as it was, from somewhere around the object, is one
 /// more view to agree with, though less. `others` are more clouds of the same object. These pictures are the mean of all:
 /// where guesses differ, their mean is nearer to the truth than most. For the same reason the optimization begins with as many
 /// of them in one place as there are to be Gaussians, each fainter, so that together they show about what one alone does.
@@ -61,14 +61,19 @@ pub fn optimize<'a>(
         let by_silhouette = silhouettes.as_ref().filter(|_| step % 2 == 0);
         let by_silhouette =
             by_silhouette.map(|targets| (targets, next_views(&mut silhouette_queue, further, 1, &mut anchor_rng)));
-        let held = next_views(&mut queue, anchors.views(), 1, &mut anchor_rng);
+        // The other ones than those of silhouettes.
+        let held = if anchors.due(step) { anchors.views() } else { 0 };
+        let held = next_views(&mut queue, held, 1, &mut anchor_rng);
         let (by_silhouette, held) = rayon::join(
             || by_silhouette.map(|(targets, chosen)| Objective::silhouettes(cloud, targets, &chosen)).transpose(),
             || held.first().map(|&view| anchors.objective(cloud, view, background)).transpose(),
         );
         Ok(by_silhouette?.into_iter().chain(held?).collect())
     };
-    let of_step = |step| coarse.as_ref().filter(|_| step < first).unwrap_or(&targets);
+    let of_step = |step| match &coarse {
+        Some(coarse) if step < first => (coarse, 1.0),
+        _ => (&targets, config.window),
+    };
     descend(start, of_step, &fit, &mut rng, more, progress)
 }
 

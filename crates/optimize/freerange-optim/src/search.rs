@@ -89,20 +89,21 @@ pub(crate) fn going_on(config: &InitialFitConfig) -> InitialFitConfig {
     InitialFitConfig { iterations: config.iterations.div_ceil(ROUNDS), ..config.clone() }
 }
 
-/// The symmetry near `start` of the least `value`, and that. Moves begin with `reach` and end with `least`.
+/// The symmetry near `start` of the least `value`, and that. Moves begin with `reach` and end with `least`. `value` is told the
+/// least so far: it need not compute exactly what reaches that.
 pub(crate) fn place<S: Symmetry>(
     start: S,
     [reach, least]: [f64; 2],
-    value: impl Fn(&S) -> Result<f64, FitError>,
+    value: impl Fn(&S, f64) -> Result<f64, FitError>,
 ) -> Result<(f64, S), FitError> {
-    let mut best = (value(&start)?, start);
+    let mut best = (value(&start, f64::INFINITY)?, start);
     let mut step = reach;
     while step > least {
         let mut better = false;
         for way in 0..S::WAYS {
             for sign in [-step, step] {
                 let next = best.1.moved(way, sign);
-                let found = value(&next)?;
+                let found = value(&next, best.0)?;
                 if found < best.0 {
                     best = (found, next);
                     better = true;
@@ -117,36 +118,55 @@ pub(crate) fn place<S: Symmetry>(
     Ok(best)
 }
 
-/// Mean absolute difference between a cloud and views of it, from their own cameras or from those that a symmetry makes of them: of alpha,
-/// plus, where `colors` count, that of color times alpha.
-pub(crate) fn difference<S: Symmetry>(
-    cloud: &Gaussians,
-    targets: &Targets,
-    symmetry: Option<&S>,
+/// Views to compare renders with.
+pub(crate) struct Pictures<'a> {
+    targets: &'a Targets,
+    pixels: Vec<Vec<[f32; 4]>>, // of each view, color times alpha, and alpha
     colors: bool,
-) -> Result<f64, FitError> {
-    let all: Vec<usize> = (0..targets.cameras.len()).collect();
-    let (mut sum, mut count) = (0.0, 0u32);
-    for (group, raster) in targets.groups(&all) {
-        let cameras: Vec<Vec<Camera>> = group
-            .iter()
-            .map(|&i| symmetry.map_or_else(|| vec![targets.cameras[i]], |s| s.cameras(&targets.cameras[i])))
-            .collect();
-        let copies = cameras[0].len();
-        let cameras = cameras.concat();
-        let output = render(cloud.rows(), &cameras, &vec![[0.0; 3]; cameras.len()], raster)?;
-        let (width, height) = targets.size(group[0]);
-        let rendered = output.rgb.as_chunks::<3>().0.iter().zip(&output.alpha);
-        for (index, (rgb, alpha)) in rendered.enumerate() {
-            let (image, y, x) = (group[index / (width * height) / copies], index / width % height, index % width);
-            let x = if S::MIRRORS && symmetry.is_some() { width - 1 - x } else { x };
-            let [r, g, b, a] = targets.images[image].get_pixel(x as u32, y as u32).0.map(|v| f32::from(v) / 255.0);
-            let color = (rgb[0] - a * r).abs() + (rgb[1] - a * g).abs() + (rgb[2] - a * b).abs();
-            sum += f64::from(if colors { color / 3.0 } else { 0.0 } + (alpha - a).abs());
-            count += 1;
-        }
+}
+
+impl<'a> Pictures<'a> {
+    /// The views of `targets`; without `colors` alpha alone counts.
+    pub fn new(targets: &'a Targets, colors: bool) -> Self {
+        let straight = |p: &image::Rgba<u8>| {
+            let [r, g, b, a] = p.0.map(|v| f32::from(v) / 255.0);
+            [a * r, a * g, a * b, a]
+        };
+        Self { targets, pixels: targets.images.iter().map(|i| i.pixels().map(straight).collect()).collect(), colors }
     }
-    Ok(sum / f64::from(count.max(1)))
+
+    /// Mean absolute difference between a cloud and the views, from their own cameras or from those that a symmetry makes of them:
+    /// of alpha, plus, where colors count, that of color times alpha. From `enough` on what it is so far.
+    pub fn difference<S: Symmetry>(
+        &self,
+        cloud: &Gaussians,
+        symmetry: Option<&S>,
+        enough: f64,
+    ) -> Result<f64, FitError> {
+        let targets = self.targets;
+        let cameras = |i: usize| symmetry.map_or_else(|| vec![targets.cameras[i]], |s| s.cameras(&targets.cameras[i]));
+        let count: usize = (0..self.pixels.len()).map(|i| self.pixels[i].len() * cameras(i).len()).sum();
+        let (mut sum, count) = (0.0, count.max(1) as f64);
+        for (i, pixels) in self.pixels.iter().enumerate() {
+            let cameras = cameras(i);
+            let (width, _) = targets.size(i);
+            let one = [i];
+            let (_, raster) = targets.groups(&one).next().expect("one view is one group");
+            let output = render(cloud.rows(), &cameras, &vec![[0.0; 3]; cameras.len()], raster)?;
+            let rows = output.rgb.as_chunks::<3>().0.chunks_exact(width).zip(output.alpha.chunks_exact(width));
+            for ((rgb, alpha), expected) in rows.zip(pixels.chunks_exact(width).cycle()) {
+                for x in 0..width {
+                    let [r, g, b, a] = expected[if S::MIRRORS && symmetry.is_some() { width - 1 - x } else { x }];
+                    let color = (rgb[x][0] - r).abs() + (rgb[x][1] - g).abs() + (rgb[x][2] - b).abs();
+                    sum += f64::from(if self.colors { color / 3.0 } else { 0.0 } + (alpha[x] - a).abs());
+                }
+            }
+            if sum / count >= enough {
+                break;
+            }
+        }
+        Ok(sum / count)
+    }
 }
 
 /// What lies within the silhouettes of all views.
@@ -183,6 +203,10 @@ impl<'a> Hull<'a> {
     pub fn uncovered(&self, copies: &[impl Fn(DVec3) -> DVec3]) -> f64 {
         let mut covered: Vec<Vec<bool>> = self.silhouettes.iter().map(|o| vec![false; o.len()]).collect();
         for (i, &point) in self.points.iter().enumerate() {
+            // Most points show nothing that others did not.
+            if covered.iter().zip(&self.pixels).all(|(covered, pixels)| covered[pixels[i]]) {
+                continue;
+            }
             if copies.iter().all(|copy| self.within(copy(point))) {
                 covered.iter_mut().zip(&self.pixels).for_each(|(covered, pixels)| covered[pixels[i]] = true);
             }

@@ -1,7 +1,7 @@
 //! Fits of small scenes that the rasterizer itself has drawn, and what all tests share.
 
 use crate::*;
-use crate::{initial::continue_fit, views::Targets};
+use crate::{anchors::Anchors, initial::continue_fit, views::Targets};
 use freerange_gaussians::{Gaussians, channel};
 use freerange_raster::{RasterConfig, render};
 use freerange_scene::camera::{Camera, View};
@@ -55,6 +55,45 @@ pub(crate) fn photograph(cloud: &Gaussians, camera: &Camera) -> View {
         pixel[3] = (alpha * 255.0).round() as u8;
     }
     View { name: "view".into(), camera: *camera, image }
+}
+
+/// A window is what the whole view shows there, and shows the object.
+#[test]
+fn windows_are_parts_of_views() {
+    let cloud = ball(3, 1);
+    let views = ring(3, 40, &cloud);
+    let targets = Targets::new(&views, None).unwrap();
+    let mut rng = ChaCha8Rng::seed_from_u64(5);
+    let background = [0.3, 0.6, 0.1];
+    let config = RasterConfig::default();
+    let mut places = std::collections::HashSet::new();
+    for _ in 0..10 {
+        let windows = targets.windows(&[2, 0], 0.5, &mut rng);
+        assert_eq!((windows.views, windows.images.len(), windows.size(0)), (2, 2, (20, 20)));
+        for (k, of) in [2, 0].into_iter().enumerate() {
+            let (camera, whole) = (windows.cameras[k], targets.cameras[of]);
+            let (x, y) = ((whole.cx - camera.cx) as usize, (whole.cy - camera.cy) as usize);
+            places.insert((x, y));
+            assert!(windows.images[k].pixels().any(|p| p[3] > 0));
+            assert_eq!(windows.images[k].get_pixel(3, 7), targets.images[of].get_pixel(x as u32 + 3, y as u32 + 7));
+            let part = render(cloud.rows(), &[camera], &[background], &config).unwrap();
+            let all = render(cloud.rows(), &[whole], &[background], &config).unwrap();
+            for (i, found) in part.rgb.chunks(60).enumerate() {
+                let expected = &all.rgb[3 * ((y + i) * 40 + x)..][..60];
+                let off = found.iter().zip(expected).map(|(a, b)| (a - b).abs());
+                // Opacities below 1/255 are left out, which rounding decides.
+                assert!(off.clone().all(|off| off < 5e-3) && off.filter(|off| *off > 1e-4).count() <= 6, "row {i}");
+            }
+        }
+    }
+    assert!(places.len() > 5, "{places:?}");
+    // All of a view is a window, too.
+    let all = targets.windows(&[1], 1.0, &mut rng);
+    assert_eq!((all.images[0].clone(), all.cameras[0].cx), (targets.images[1].clone(), targets.cameras[1].cx));
+    // Where there is no object it is in the middle.
+    let empty = View { image: image::RgbaImage::new(40, 40), ..views[0].clone() };
+    let windows = Targets::new(&[empty], None).unwrap().windows(&[0], 0.25, &mut rng);
+    assert_eq!(targets.cameras[0].cx - windows.cameras[0].cx, 15.0);
 }
 
 /// Many silhouettes may share one picture, which is shrunk once.
@@ -235,6 +274,19 @@ fn disturbed(cloud: &Gaussians, seed: u64) -> Gaussians {
 
 fn small_anchors() -> AnchorConfig {
     AnchorConfig { size: 48, ..Default::default() }
+}
+
+#[test]
+fn anchors_weigh_as_much_however_seldom_they_are_looked_at() {
+    let at = |every| Anchors::new(&[ball(12, 1)], &AnchorConfig { every, ..small_anchors() }).unwrap();
+    let loss = |anchors: &Anchors| anchors.objective(&ball(12, 2), 3, [0.2; 3]).unwrap().loss;
+    for every in [1, 2, 3] {
+        let anchors = at(every);
+        assert_eq!((1..=12).filter(|&step| anchors.due(step)).count() * every, 12);
+        assert!((loss(&anchors) / loss(&at(1)) - every as f64).abs() < 1e-6);
+    }
+    // Silhouettes come at even steps.
+    assert!(at(2).due(1) && !at(2).due(2));
 }
 
 #[test]

@@ -4,7 +4,8 @@ use crate::FitError;
 use freerange_raster::RasterConfig;
 use freerange_scene::camera::{Camera, View, image_ops};
 use glam::{DMat3, DVec3};
-use image::RgbaImage;
+use image::{RgbaImage, imageops::crop_imm};
+use rand::Rng;
 use rayon::prelude::*;
 
 /// What a fit is to agree with. Views alone are one, too.
@@ -50,6 +51,9 @@ impl<'a, const N: usize> From<&'a [View; N]> for Evidence<'a> {
         views.as_slice().into()
     }
 }
+
+/// How often a point of the object is looked for.
+const TRIES: usize = 64;
 
 /// Views, each of its own size, and after them those of which the silhouette alone counts.
 pub(crate) struct Targets {
@@ -133,6 +137,29 @@ impl Targets {
     pub fn groups<'a>(&'a self, chosen: &'a [usize]) -> impl Iterator<Item = (&'a [usize], &'a RasterConfig)> {
         let kind = |i: usize| (self.images[i].dimensions(), self.rasters[i].blur.to_bits());
         chosen.chunk_by(move |&a, &b| kind(a) == kind(b)).map(|group| (group, &self.rasters[group[0]]))
+    }
+
+    /// Windows of the views `chosen`, as views: each about a random point of the object, `part` of the view's width and height.
+    pub fn windows(&self, chosen: &[usize], part: f64, rng: &mut impl Rng) -> Self {
+        let mut windows = Self { cameras: Vec::new(), images: Vec::new(), views: chosen.len(), rasters: Vec::new() };
+        for &i in chosen {
+            let image = &self.images[i];
+            let (width, height) = image.dimensions();
+            let [w, h] = [width, height].map(|side| ((f64::from(side) * part).round() as u32).clamp(1, side));
+            // Where nothing of the object is found, the middle.
+            let at = (0..TRIES)
+                .map(|_| (rng.random_range(0..width), rng.random_range(0..height)))
+                .find(|&(x, y)| image.get_pixel(x, y).0[3] > 0)
+                .unwrap_or((width / 2, height / 2));
+            let x = at.0.saturating_sub(w / 2).min(width - w);
+            let y = at.1.saturating_sub(h / 2).min(height - h);
+            let camera = self.cameras[i];
+            let (cx, cy) = (camera.cx - f64::from(x), camera.cy - f64::from(y));
+            windows.cameras.push(Camera { width: w, height: h, cx, cy, ..camera });
+            windows.images.push(crop_imm(image, x, y, w, h).to_image());
+            windows.rasters.push(self.rasters[i]);
+        }
+        windows
     }
 
     /// Width and height of view `i` in pixels.

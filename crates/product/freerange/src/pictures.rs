@@ -10,7 +10,8 @@ use freerange_scene::camera::{
 };
 use freerange_util::IoError;
 use glam::{DMat4, DVec3};
-use image::{Delay, Frame, RgbaImage, codecs::gif};
+use image::RgbaImage;
+use rayon::prelude::*;
 
 use crate::{Error, error::Lift};
 
@@ -75,21 +76,27 @@ pub fn on_white(image: &RgbaImage) -> RgbaImage {
 ///
 /// # Errors
 /// If the file cannot be written, or the rasterizer refuses the cloud.
-pub fn write_turntable(path: &Path, cloud: &Gaussians, frames: u32, size: u32) -> Result<(), Error> {
-    let file = std::fs::File::create(path).map_err(IoError::at(path)).lift()?;
-    let mut encoder = gif::GifEncoder::new_with_speed(std::io::BufWriter::new(file), 10);
-    let broken = |source: image::ImageError| Error::picture(path, source);
-    encoder.set_repeat(gif::Repeat::Infinite).map_err(broken)?;
-    for i in 0..frames {
+pub fn write_turntable(path: &Path, cloud: &Gaussians, frames: u16, side: u16) -> Result<(), Error> {
+    let (frames, size, delay) = (u32::from(frames), u32::from(side), 200 / frames.max(1));
+    let frame = |i: u32| {
         let azimuth = std::f64::consts::TAU * f64::from(i) / f64::from(frames);
         let elevation = 20f64.to_radians();
         let direction = DVec3::new(azimuth.cos() * elevation.cos(), azimuth.sin() * elevation.cos(), elevation.sin());
         let camera = Camera::look_at(1.6 * direction, DVec3::ZERO, DVec3::Z, 45f64.to_radians(), size, size);
-        let picture = to_picture(&render_view(cloud, &camera)?, size, size);
-        let frame = Frame::from_parts(picture, 0, 0, Delay::from_numer_denom_ms(2000, frames.max(1)));
-        encoder.encode_frame(frame).map_err(broken)?;
-    }
-    Ok(())
+        let mut picture = to_picture(&render_view(cloud, &camera)?, size, size);
+        // Most of the time goes to choosing 256 colors.
+        let frame = gif::Frame::from_rgba_speed(side, side, &mut picture, 10);
+        Ok(gif::Frame { delay, dispose: gif::DisposalMethod::Background, ..frame })
+    };
+    let pictures = (0..frames).into_par_iter().map(frame).collect::<Result<Vec<_>, Error>>()?;
+    let broken = |source: gif::EncodingError| {
+        let source = image::error::EncodingError::new(image::ImageFormat::Gif.into(), source);
+        Error::picture(path, image::ImageError::Encoding(source))
+    };
+    let file = std::fs::File::create(path).map_err(IoError::at(path)).lift()?;
+    let mut encoder = gif::Encoder::new(std::io::BufWriter::new(file), side, side, &[]).map_err(broken)?;
+    encoder.set_repeat(gif::Repeat::Infinite).map_err(broken)?;
+    pictures.iter().try_for_each(|frame| encoder.write_frame(frame)).map_err(broken)
 }
 
 #[cfg(test)]
