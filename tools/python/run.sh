@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # The Python package in an environment of its own: it is built and installed by pip; types; tests, the README's five lines, gradients through PyTorch, TensorBoard's reader
-# and the notebook among them; every step in a file of Rerun's; and the time of a reconstruction beside the command line's. Says what it leaves out where packages cannot be had.
+# and the notebooks among them; every step in a file of Rerun's; and the time of a reconstruction beside the command line's. Says what it leaves out where packages cannot be had.
 #
 #     tools/python/run.sh target/release/freerange [FEATURES]
 #
@@ -39,6 +39,7 @@ wanted "PyTorch, and gradients through it" torch "${TORCH:-yes}" || without+=(--
 (cd python && "$folder/venv/bin/mypy" --python-executable "$folder/venv/bin/python")
 (cd python && "$folder/venv/bin/python" -m pytest -q -p no:cacheprovider "${without[@]}")
 (cd python && "$folder/venv/bin/python" -m pytest -q -p no:cacheprovider --nbmake --nbmake-timeout=600 examples)
+"$folder/venv/bin/python" tools/python/notebook.py examples/notebook/compare.ipynb
 if wanted "the example for Rerun" rerun-sdk "${RERUN:-yes}"; then
   "$folder/venv/bin/python" python/examples/rerun_steps.py examples/bowl "$folder/steps.rrd"
   # Without its analytics, and without a trace in the user's settings.

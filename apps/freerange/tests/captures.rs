@@ -395,3 +395,50 @@ fn the_page_finds_cameras_by_the_same_engine() {
     let about = page.ask("GET", "/server", b"");
     assert!(about["camera_finder"]["missing"].as_str().unwrap().contains("neither COLMAP nor pycolmap"), "{about}");
 }
+
+/// Whether the process of this number computes or sleeps: one that has ended may be listed until somebody waits for it.
+#[cfg(target_os = "linux")]
+fn is_alive(id: &str) -> bool {
+    let stat = fs::read_to_string(format!("/proc/{id}/stat")).unwrap_or_default();
+    stat.rsplit_once(") ").is_some_and(|(_, rest)| !rest.starts_with(['Z', 'X']))
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn an_engine_ends_with_a_program_that_is_killed() {
+    let folder = tempfile::tempdir().unwrap();
+    let views = ring(5);
+    let (id, photos, out) = (folder.path().join("id"), folder.path().join("photos"), folder.path().join("out"));
+    fs::create_dir(&photos).unwrap();
+    views.iter().for_each(|v| v.image.save(photos.join(format!("{}.png", v.name))).unwrap());
+    // It says its number, and would go on for a minute.
+    let sleeps = format!("echo $$ > {0}.new\nmv {0}.new {0}\nexec sleep 60", id.display());
+    let program = engine(folder.path(), &views, "[5]", &sleeps);
+    let soon = |what: &str, done: &dyn Fn() -> bool| {
+        let begun = (0..400).any(|_| {
+            std::thread::sleep(std::time::Duration::from_millis(50));
+            done()
+        });
+        assert!(begun, "{what}");
+    };
+    let number = || fs::read_to_string(&id).unwrap().trim().to_owned();
+    let ended = |number: &str| soon("the engine ends", &|| !is_alive(number));
+
+    let mut poses = Command::new(env!("CARGO_BIN_EXE_freerange"));
+    poses.args(["poses", photos.to_str().unwrap(), "-o", out.to_str().unwrap(), "--python", program.to_str().unwrap()]);
+    let mut poses = poses.spawn().unwrap();
+    soon("the engine begins", &|| id.exists());
+    let engine_of_poses = number();
+    assert!(is_alive(&engine_of_poses));
+    poses.kill().unwrap(); // SIGKILL
+    poses.wait().unwrap();
+    ended(&engine_of_poses);
+
+    fs::remove_file(&id).unwrap();
+    let page = Page::start(&["--python", program.to_str().unwrap()], None);
+    page.photos(&views, |_| id.exists());
+    let engine_of_page = number();
+    assert!(is_alive(&engine_of_page));
+    drop(page);
+    ended(&engine_of_page);
+}

@@ -92,8 +92,12 @@ fn reconstruct_writes_everything_and_its_cloud_can_be_rendered_from_the_users_ca
         "optimize.max_resolution=256",
         "--json",
     ];
-    let done = freerange(&args);
-    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    let mut command = Command::new(env!("CARGO_BIN_EXE_freerange"));
+    let done = command.args(args).env_remove("XDG_RUNTIME_DIR").output().unwrap();
+    let said = String::from_utf8_lossy(&done.stderr);
+    assert!(done.status.success(), "{said}");
+    // Without a graphics card nothing is asked of Vulkan, whose layers look for a display.
+    assert!(Path::new("/dev/dri").exists() || !said.contains("XDG_RUNTIME_DIR"), "{said}");
     let report: serde_json::Value = serde_json::from_slice(&done.stdout).unwrap();
     for file in ["gaussians.ply", "turntable.gif", "report.json", "inputs"] {
         assert!(output.join(file).exists(), "{file}");

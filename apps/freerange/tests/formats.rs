@@ -59,6 +59,14 @@ fn convert_goes_to_every_format_and_back() {
             assert!(found.covariance(k).abs_diff_eq(cloud.covariance(i), 2e-4), "{extension}");
         }
     }
+    // A page knows its up, as a .ply does.
+    let (page, again) = (folder.path().join("there.html"), folder.path().join("again.spz"));
+    assert!(freerange(&["convert", text(&page), text(&again)]).status.success());
+    let found = read(&again, Frame::Y_DOWN).unwrap();
+    assert!((0..10).all(|i| (found.splats.cloud.mean(i) - cloud.mean(i)).length() < 1e-4));
+    // Our own .spz is read without a word.
+    let done = freerange(&["convert", text(&again), text(&folder.path().join("back.ply"))]);
+    assert!(done.status.success() && done.stderr.is_empty(), "{}", String::from_utf8_lossy(&done.stderr));
     // From a frame into another.
     let turned = folder.path().join("turned.ply");
     assert!(freerange(&["convert", text(&source), text(&turned), "--frame", "y-down:z-up"]).status.success());

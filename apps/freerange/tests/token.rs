@@ -52,6 +52,27 @@ fn a_token_is_drawn_and_printed_once() {
     assert_eq!((one.status(&token(&one)), one.status(&token(&other)), one.status("")), (200, 401, 401));
 }
 
+/// The first lines that a server prints.
+fn lines(arguments: &[&str], count: usize) -> (Server, Vec<String>) {
+    let mut child = serve().args(arguments).stdout(Stdio::piped()).spawn().unwrap();
+    let lines = BufReader::new(child.stdout.take().unwrap()).lines();
+    let found: Vec<String> = lines.take(count).map(Result::unwrap).collect();
+    (Server(child, found[0].clone()), found)
+}
+
+#[test]
+fn a_link_is_printed_for_each_name() {
+    let (server, found) = lines(&["--name", "splats.example", "--name", "other.example"], 3);
+    let token = found[0].split_once("/?token=").unwrap().1;
+    assert_eq!(found[1..], ["splats", "other"].map(|name| format!("https://{name}.example/?token={token}")));
+    assert_eq!(server.status(token), 200);
+    // Beyond loopback the name leads here without a proxy.
+    let (_server, found) = lines(&["--host", "0.0.0.0", "--name", "splats.example"], 2);
+    let (address, token) = found[0].split_once("/?token=").unwrap();
+    let port = address.rsplit_once(':').unwrap().1;
+    assert_eq!(found[1], format!("http://splats.example:{port}/?token={token}"));
+}
+
 #[test]
 fn a_token_of_ones_own_is_not_printed() {
     let folder = tempfile::tempdir().unwrap();

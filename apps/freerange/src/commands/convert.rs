@@ -18,9 +18,10 @@ use crate::error::CliError;
 ///
 /// --mesh renders depths from all around and fuses them; what no camera sees counts as inside.
 #[derive(clap::Args)]
+#[command(override_usage = "freerange convert [OPTIONS] <INPUT>... <OUTPUT>")]
 pub struct Args {
-    /// Files to read, then the file to write.
-    #[arg(required = true, num_args = 2.., value_names = ["INPUT", "OUTPUT"])]
+    /// One or more files to read (INPUT), then the file to write (OUTPUT).
+    #[arg(required = true, num_args = 2.., value_name = "FILE")]
     files: Vec<PathBuf>,
     /// Frame of formats that define none: z-up (this program), y-up or y-down [default: z-up, or what a .ply says].
     ///

@@ -6,7 +6,7 @@ use std::{
     env::VarError,
     fs::File,
     io::{Read, Write},
-    net::IpAddr,
+    net::{IpAddr, SocketAddr},
     ops::ControlFlow,
     path::PathBuf,
     process::Command,
@@ -55,6 +55,8 @@ pub struct Args {
     #[arg(long)]
     no_token: bool,
     /// Allowed Host header beside addresses, such as the name behind a proxy; may be repeated.
+    ///
+    /// A link with it is printed: https://HOST/ if --host is loopback, else http://HOST:PORT/.
     #[arg(long, value_name = "HOST")]
     name: Vec<String>,
     /// Folder that keeps jobs beyond the server's end [default: a temporary folder].
@@ -153,14 +155,22 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     let server = Server::bind(&config, Arc::new(engine))?;
     let stopper = server.stopper();
     signals.on_first(move || stopper.stop())?;
-    let link = match &token.text {
-        Some(text) => format!("{}?token={text}", server.url()),
-        None => server.url(),
-    };
+    let query = token.text.as_ref().map(|text| format!("?token={text}")).unwrap_or_default();
     // A secret that came from elsewhere does not belong into logs.
-    println!("{}", if token.is_new { link.clone() } else { server.url() });
-    let _page = if args.open { open(&link) } else { None };
+    let shown = if token.is_new { query.as_str() } else { "" };
+    let links = std::iter::once(server.url()).chain(args.name.iter().map(|name| named(name, server.address())));
+    // At once: who reads the first line only may close the pipe then.
+    print!("{}", links.map(|link| format!("{link}{shown}\n")).collect::<String>());
+    let _page = if args.open { open(&format!("{}{query}", server.url())) } else { None };
     server.run().map_err(CliError::failure)
+}
+
+/// The page's address by the name of a host. On loopback only a proxy of this machine can have that name, and proxies encrypt.
+fn named(name: &str, address: SocketAddr) -> String {
+    match address.ip().is_loopback() {
+        true => format!("https://{name}/"),
+        false => format!("http://{name}:{}/", address.port()),
+    }
 }
 
 /// The access token, and where it came from.

@@ -160,18 +160,26 @@ impl Board {
     }
 
     /// Changes a job, writes its record, and tells everyone who looks. The disk may take its time: meanwhile others see the job as it was, and
-    /// nobody waits for the table.
+    /// nobody waits for the table. A job whose next state cannot be written has failed: after the next start it would not be in that state.
     fn change<T>(&self, id: &str, change: impl FnOnce(&mut Job) -> Result<T, Refusal>) -> Result<T, Refusal> {
         let writing = self.writing(id)?;
         let _one = writing.lock().unwrap_or_else(PoisonError::into_inner);
-        let (result, record, folder) = {
+        let (result, mut record, folder, was) = {
             let mut table = self.table();
             let job = table.jobs.get_mut(id).ok_or_else(no_such)?;
             let before = job.record.clone();
+            let was = before.state;
             let result = change(job)?;
-            (result, std::mem::replace(&mut job.record, before), job.folder.clone())
+            (result, std::mem::replace(&mut job.record, before), job.folder.clone(), was)
         };
         let written = record.write(&folder).map_err(Refusal::own);
+        let over = matches!(record.state, State::Failed | State::Cancelled | State::Interrupted);
+        if let Err(e) = &written
+            && record.state != was
+            && !over
+        {
+            (record.state, record.error) = (State::Failed, Some(e.text.clone()));
+        }
         let mut table = self.table();
         let version = table.next_version();
         let job = table.jobs.get_mut(id).ok_or_else(no_such)?;

@@ -1,4 +1,4 @@
-//! What folders take on disk.
+//! What folders take on disk, and whether there is room.
 
 use std::{fs, path::Path};
 
@@ -11,4 +11,16 @@ pub fn size_of(folder: &Path) -> u64 {
         Err(_) => 0,
     };
     entries.map(size).sum()
+}
+
+/// The system's errors of a disk without room, and of a quota that is used up.
+const FULL: [&str; 2] = match () {
+    () if cfg!(windows) => ["(os error 112)", "(os error 39)"],
+    () if cfg!(target_os = "linux") => ["(os error 28)", "(os error 122)"],
+    () => ["(os error 28)", "(os error 69)"],
+};
+
+/// Whether an error's text is that of a full disk. The text, since not every library hands the system's error on.
+pub fn is_full(text: &str) -> bool {
+    text.contains("No space left on device") || FULL.iter().any(|code| text.contains(code))
 }

@@ -2,6 +2,8 @@
 
 use freerange_util::{Invalid, IoError};
 
+use crate::disk::is_full;
+
 /// Why a server cannot be.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -36,14 +38,33 @@ impl Refusal {
         Self { status, text: text.into() }
     }
 
-    /// For failures that are the server's own.
+    /// For failures that are the server's own. A full disk is named: whoever asked may know whom to tell, or remove jobs.
     pub(crate) fn own(what: impl std::fmt::Display) -> Self {
-        tracing::error!("{what}");
-        Self::new(500, "the server failed; its log says why")
+        let text = what.to_string();
+        tracing::error!("{text}");
+        match is_full(&text) {
+            true => Self::new(507, "the server's disk is full"),
+            false => Self::new(500, "the server failed; its log says why"),
+        }
     }
 }
 
 /// A cause and all that lies beneath it.
 pub(crate) fn chain(error: &(dyn std::error::Error + 'static)) -> String {
     freerange_util::with_causes(error, "; because: ")
+}
+
+#[cfg(all(test, unix))]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_full_disk_is_named() {
+        let full = || std::io::Error::from_raw_os_error(28); // ENOSPC
+        let nested = IoError::at(std::path::Path::new("job.json"))(full());
+        for refusal in [Refusal::own(full()), Refusal::own(nested)] {
+            assert_eq!(refusal, Refusal::new(507, "the server's disk is full"));
+        }
+        assert_eq!(Refusal::own(std::io::Error::from_raw_os_error(2)).status, 500);
+    }
 }

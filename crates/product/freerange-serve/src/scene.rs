@@ -18,7 +18,13 @@ use image::{GrayImage, ImageFormat, ImageReader, Luma, Rgba, RgbaImage};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use crate::{Engine, Limits, Refusal, Scene, disk::size_of, error::chain, plain, upload::all_inside};
+use crate::{
+    Engine, Limits, Refusal, Scene,
+    disk::{is_full, size_of},
+    error::chain,
+    plain,
+    upload::all_inside,
+};
 
 /// How photos are read, as a client says it; everything may be left out.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -121,14 +127,16 @@ pub fn is_whole(folder: &Path) -> bool {
 }
 
 fn save(picture: &RgbaImage, path: &Path) -> Result<(), Refusal> {
-    let file = fs::File::create(path).map_err(Refusal::own)?;
+    let mut bytes = Vec::new();
     // Fast rather than small: these files are read on the same machine.
     let fast = image::codecs::png::PngEncoder::new_with_quality(
-        std::io::BufWriter::new(file),
+        &mut bytes,
         image::codecs::png::CompressionType::Fast,
         image::codecs::png::FilterType::Adaptive,
     );
-    picture.write_with_encoder(fast).map_err(Refusal::own)
+    picture.write_with_encoder(fast).map_err(Refusal::own)?;
+    // At once: a buffer that is dropped does not report a full disk.
+    fs::write(path, bytes).map_err(Refusal::own)
 }
 
 /// Photos of a client, and what is made of them.
@@ -160,7 +168,10 @@ impl Preparation<'_> {
                     ),
                 )
             }
-            error => Refusal::new(422, plain::sentence(&chain(error), self.upload)),
+            error => {
+                let text = chain(error);
+                if is_full(&text) { Refusal::own(text) } else { Refusal::new(422, plain::sentence(&text, self.upload)) }
+            }
         }
     }
 

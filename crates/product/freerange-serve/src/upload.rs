@@ -10,7 +10,7 @@ use std::{
 
 use image::{ImageFormat, ImageReader};
 
-use crate::{Limits, Refusal};
+use crate::{Limits, Refusal, disk::is_full};
 
 /// Longest part of a name, in bytes.
 const NAME: usize = 120;
@@ -18,7 +18,7 @@ const NAME: usize = 120;
 const DEPTH: usize = 6;
 const PICTURES: [&str; 4] = ["png", "jpg", "jpeg", "webp"];
 const CAMERAS: [&str; 5] = ["json", "bin", "txt", "xml", "csv"];
-const SPLATS: [&str; 7] = ["ply", "splat", "spz", "sog", "glb", "usda", "usdz"];
+const SPLATS: [&str; 8] = ["ply", "splat", "spz", "sog", "glb", "usda", "usdz", "html"];
 const ARCHIVES: [&str; 9] = ["zip", "gz", "tgz", "tar", "7z", "rar", "xz", "zst", "bz2"];
 /// Most bytes of a JSON file: its reader holds it whole.
 const JSON: u64 = 8 << 20;
@@ -129,8 +129,10 @@ impl<'a> Upload<'a> {
         let path = parts.iter().fold(self.folder.to_path_buf(), |path, part| path.join(part));
         fs::create_dir_all(path.parent().unwrap_or(self.folder)).map_err(Refusal::own)?;
         // Nothing is ever overwritten, whatever letters a file system takes for the same.
-        let file = File::create_new(&path)
-            .map_err(|_| Refusal::new(422, format!("file `{}` comes twice, or once as a folder", shown(name))))?;
+        let file = File::create_new(&path).map_err(|e| match is_full(&e.to_string()) {
+            true => Refusal::own(e),
+            false => Refusal::new(422, format!("file `{}` comes twice, or once as a folder", shown(name))),
+        })?;
         let mut writer = BufWriter::new(file);
         let mut size = 0u64;
         let is_json = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("json"));
@@ -150,9 +152,9 @@ impl<'a> Upload<'a> {
             if size > most {
                 return Err(Refusal::new(413, format!("file `{}`: expected at most {most} bytes", shown(name))));
             }
-            writer.write_all(&chunk[..n]).map_err(|e| written(&e))?;
+            writer.write_all(&chunk[..n]).map_err(Refusal::own)?;
         }
-        writer.flush().map_err(|e| written(&e))?;
+        writer.flush().map_err(Refusal::own)?;
         drop(writer);
         match kind {
             Kind::Splats => self.splats.push((path.clone(), shown(name))),
@@ -204,14 +206,6 @@ impl<'a> Upload<'a> {
             return Err(Refusal::new(413, format!("expected images of at most {all} pixels together")));
         }
         Ok(())
-    }
-}
-
-/// Why a file could not be written.
-fn written(error: &std::io::Error) -> Refusal {
-    match error.kind() {
-        std::io::ErrorKind::StorageFull => Refusal::new(507, "the server's disk is full"),
-        _ => Refusal::own(error),
     }
 }
 

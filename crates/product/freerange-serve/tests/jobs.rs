@@ -198,6 +198,26 @@ fn one_computes_at_a_time_and_cancelling_works_at_once() {
     assert_eq!(server.json(&format!("/jobs/{}", ids[0]))["samples"], serde_json::json!([]));
 }
 
+/// A folder that is gone stands for a disk that cannot be written.
+#[test]
+fn a_job_whose_state_cannot_be_written_fails() {
+    let keep = tempfile::tempdir().unwrap();
+    let config = ServeConfig { keep: Some(keep.path().into()), example: Some(EXAMPLE), ..ServeConfig::default() };
+    let server = Running::start(config, Fake::slow());
+    let cancel = |id: &str| assert_eq!(server.send("POST", &format!("/jobs/{id}/cancel"), "", b"").status, 200);
+    let first = server.example("{}");
+    server.until(&first, &["running"]);
+    let second = server.example("{}");
+    server.until(&second, &["queued"]);
+    fs::remove_dir_all(keep.path().join(&second)).unwrap();
+    cancel(&first);
+    // It does not count as running for ever, and the next one has its turn.
+    assert_eq!(server.until(&second, &["failed"])["error"], "the server failed; its log says why");
+    let third = server.example("{}");
+    server.until(&third, &["running"]);
+    cancel(&third);
+}
+
 #[test]
 fn a_panic_is_the_jobs_not_the_servers() {
     let server = Running::plain(Arc::new(Fake { panics: true, ..Fake::default() }));
@@ -312,8 +332,9 @@ fn a_file_of_gaussians_is_a_result() {
         ("Mug.SPZ", Format::Spz, [0.0, 0.0, 1.0]),
         ("mug.glb", Format::Glb, [0.0, 0.0, 1.0]),
         ("mug.usdz", Format::Usdz, [0.0, 0.0, 1.0]),
+        ("mug.html", Format::Html, [0.0, -1.0, 0.0]),
     ] {
-        let frame = if format == Format::Ply { Frame::Y_DOWN } else { Frame::Z_UP };
+        let frame = if matches!(format, Format::Ply | Format::Html) { Frame::Y_DOWN } else { Frame::Z_UP };
         let reply = server.post_form(&[Part::file(name, file(format, frame))]);
         assert_eq!(reply.status, 201, "{name}: {}", reply.text());
         let id = reply.json()["id"].as_str().unwrap().to_owned();
@@ -372,6 +393,7 @@ fn files_of_gaussians_that_cannot_be_shown_are_refused() {
     for (name, bytes, words) in [
         ("a.ply", ply[..ply.len() / 2].to_vec(), "a.ply"),
         ("a.spz", b"no such thing".to_vec(), "a.spz"),
+        ("a.html", b"<p>no Gaussians here".to_vec(), "give the file of Gaussians that it shows"),
         ("a.glb", file(Format::Spz, Frame::Z_UP), "a.glb"),
         (
             "a.ply",

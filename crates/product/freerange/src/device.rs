@@ -1,8 +1,9 @@
 //! Where to compute: devices by name.
 
 use std::{
-    fmt,
+    fmt, fs,
     panic::{AssertUnwindSafe, catch_unwind},
+    path::Path,
     str::FromStr,
 };
 
@@ -50,6 +51,9 @@ impl Device {
 
     /// Its name, and what it can do. No other one is opened.
     pub fn info(&self) -> DeviceInfo {
+        if *self == Self::cpu() {
+            return DeviceInfo::cpu(); // without a search for GPUs
+        }
         let gpu = |api: GpuApi| {
             let index = api.devices().iter().position(|found| *found == self.0)?;
             Some(DeviceInfo::gpu(api, index, &self.0))
@@ -115,6 +119,13 @@ impl GpuApi {
         }
     }
 
+    /// Whether a search can find a card. On Linux, Vulkan reaches cards by files in `dev`; where there are none, its loader only finds
+    /// processors that play a GPU, and Mesa's layers print errors of their own while they look for a display.
+    fn may_find_card(self, dev: &Path) -> bool {
+        let by_files = cfg!(target_os = "linux") && matches!(self, Self::Vulkan | Self::WebGpu);
+        !by_files || may_have_card(dev)
+    }
+
     /// The devices found, in the system's order; none where the driver is missing.
     fn devices(self) -> Vec<TensorDevice> {
         #[cfg(feature = "gpu")]
@@ -133,6 +144,20 @@ impl GpuApi {
         };
         found
     }
+}
+
+/// How files of `/dev` begin that drivers of GPUs bring with them, beside those of `/dev/dri`: NVIDIA's and those of its boards, Windows'
+/// for WSL, AMD's, Arm's, Qualcomm's, Imagination's and Vivante's.
+const CARDS: [&str; 10] = ["nvidia", "nvgpu", "nvhost", "nvmap", "dxg", "kfd", "mali", "kgsl", "pvr", "galcore"];
+
+/// Whether the folder of device files has one of a GPU that computes, or cannot be read.
+fn may_have_card(dev: &Path) -> bool {
+    let some = |folder: &Path, begins: &[&str]| {
+        let is_one = |name: &str| begins.iter().any(|begin| name.starts_with(begin));
+        fs::read_dir(folder).map(|all| all.flatten().any(|file| is_one(&file.file_name().to_string_lossy())))
+    };
+    // A folder `dri` without `renderD*` is that of a card which only shows a picture, as in many servers.
+    some(dev, &CARDS).unwrap_or(true) || some(&dev.join("dri"), &["renderD"]).unwrap_or(false)
 }
 
 /// A device as the user names it: `auto`, `cpu`, `cuda`, `cuda:1`, `vulkan:0` ...
@@ -198,7 +223,8 @@ impl DeviceName {
         match self {
             Self::Cpu => Ok(Device::cpu()),
             Self::Auto => {
-                let found = GpuApi::ALL.map(|api| (api, api.devices()));
+                let asked = GpuApi::ALL.into_iter().filter(|api| api.may_find_card(Path::new("/dev")));
+                let found = asked.map(|api| (api, api.devices()));
                 Ok(first_gpu(found, number, properties, tell).map_or_else(Device::cpu, Device))
             }
             Self::Gpu(api, _) if !api.compiled() => Err(Error::NoDevice(format!(
@@ -398,6 +424,28 @@ mod tests {
         assert!(told[1].contains("vulkan:1") && told[2].contains("the CPU computes"), "{told:?}");
         let cpu = Device::cpu().info();
         assert_eq!((cpu.name.as_str(), cpu.to_string().as_str(), cpu.problem), ("cpu", "cpu", None));
+    }
+
+    #[test]
+    fn vulkan_is_asked_only_where_a_card_can_be() {
+        let dev = std::env::temp_dir().join(format!("freerange-dev-{}", std::process::id()));
+        fs::create_dir_all(dev.join("dri")).unwrap();
+        let asked = |file: &str| {
+            fs::write(dev.join(file), "").unwrap();
+            let asked = GpuApi::ALL.map(|api| api.may_find_card(&dev));
+            fs::remove_file(dev.join(file)).unwrap();
+            asked
+        };
+        let elsewhere = cfg!(not(target_os = "linux"));
+        for none in ["null", "nvram", "dri/card0"] {
+            assert_eq!(asked(none), [true, true, elsewhere, elsewhere], "{none}");
+        }
+        for card in ["dri/renderD128", "nvidia0", "dxg", "kgsl-3d0", "mali0"] {
+            assert_eq!(asked(card), [true; 4], "{card}");
+        }
+        fs::remove_dir_all(&dev).unwrap();
+        // What cannot be read may have anything.
+        assert!(may_have_card(&dev));
     }
 
     #[test]

@@ -39,6 +39,9 @@ impl Bounds {
     }
 
     /// Runs a program to its end, or ends it. `line` hears of what it prints, if that is piped.
+    ///
+    /// On Linux the program also ends when this process is killed. On other systems it goes on then, and so do programs that it has
+    /// started itself.
     pub fn run(&self, command: &mut Command, line: &mut dyn FnMut(&str)) -> Result<ExitStatus, CliError> {
         let program = command.get_program().to_os_string();
         let failed = |e| CliError::file(program.as_ref(), e);
@@ -47,6 +50,8 @@ impl Bounds {
             // What it starts ends with it. Programs of a terminal stay in its group: Ctrl-C ends them.
             std::os::unix::process::CommandExt::process_group(command, 0);
         }
+        #[cfg(target_os = "linux")]
+        end_with_this_thread(command);
         let mut child = command.spawn().map_err(failed)?;
         let (send, lines) = mpsc::channel();
         if let Some(out) = child.stdout.take() {
@@ -84,6 +89,25 @@ impl Bounds {
             _ => Ok(()),
         }
     }
+}
+
+/// Has the kernel kill the program when the thread that spawns it ends, for whatever reason: after `kill -9` no code of ours runs.
+///
+/// It is the thread that counts, not the process: the caller has to wait for the program, as [`Bounds::run`] does.
+#[cfg(target_os = "linux")]
+fn end_with_this_thread(command: &mut Command) {
+    use std::{io::Error, os::unix::process};
+    let parent = std::process::id();
+    let ask = move || {
+        // SAFETY: sets a number of the calling process.
+        if unsafe { libc::prctl(libc::PR_SET_PDEATHSIG, libc::SIGKILL as libc::c_ulong) } != 0 {
+            return Err(Error::last_os_error());
+        }
+        // The parent may have ended before it could be asked for.
+        if process::parent_id() == parent { Ok(()) } else { Err(Error::from_raw_os_error(libc::ESRCH)) }
+    };
+    // SAFETY: between fork and exec only system calls are made, and nothing is allocated.
+    unsafe { process::CommandExt::pre_exec(command, ask) };
 }
 
 /// Ends a process, and its whole group if it has one of its own.

@@ -6,6 +6,7 @@
 use crate::{Gaussians, channel};
 use base64::{Engine, engine::general_purpose::STANDARD};
 use freerange_util::Invalid;
+use glam::DVec3;
 use sha2::{Digest, Sha256};
 
 use crate::formats::{Decoded, Encoded, Frame, error::problem, quantize::Row};
@@ -49,19 +50,22 @@ pub fn encode(cloud: &Gaussians, frame: Frame) -> Encoded {
     Encoded { bytes: page.into_bytes(), notes: Vec::new() }
 }
 
-pub fn decode(bytes: &[u8]) -> Result<Decoded, Invalid> {
+/// The Gaussians of a page, and the direction that it shows as up.
+pub fn decode(bytes: &[u8]) -> Result<(Decoded, Option<DVec3>), Invalid> {
     let wrong = |expected: &'static str, found: &dyn std::fmt::Display| problem("Gaussians", expected, found);
     let page = std::str::from_utf8(bytes).map_err(|e| problem("page", "UTF-8", e))?;
-    let data =
-        page.split_once(BEFORE).and_then(|(_, rest)| rest.split_once("\">")).and_then(|(_, d)| d.split_once(AFTER));
-    let Some((data, _)) = data else {
-        return Err(wrong("a page that this program wrote", &"none of its data"));
+    let found = page.split_once(BEFORE).and_then(|(_, rest)| rest.split_once("\">"));
+    let Some((up, data)) = found.and_then(|(up, rest)| Some((up, rest.split_once(AFTER)?.0))) else {
+        let found = "another one: give the file of Gaussians that it shows, such as a .ply";
+        return Err(wrong("a page that this program wrote, such as view.html", &found));
     };
+    let up: Option<Vec<f64>> = up.split(' ').map(|v| v.parse().ok()).collect();
+    let up = up.and_then(|up| <[f64; 3]>::try_from(up).ok()).map(DVec3::from_array);
     let data = STANDARD.decode(data.trim()).map_err(|e| wrong("base64", &e))?;
     if !data.len().is_multiple_of(size_of::<Row>()) {
         return Err(wrong("a multiple of 56 bytes", &data.len()));
     }
     let values = data.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect::<Vec<_>>();
     debug_assert!(values.len().is_multiple_of(channel::COUNT));
-    Ok(Decoded { splats: Gaussians::from_rows(values).into(), ..Decoded::default() })
+    Ok((Decoded { splats: Gaussians::from_rows(values).into(), ..Decoded::default() }, up))
 }

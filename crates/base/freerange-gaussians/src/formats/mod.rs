@@ -8,7 +8,7 @@
 //! | `.sog` | version 2, also as a folder (`meta.json`) | version 2 | the user's |
 //! | `.glb` | `KHR_gaussian_splatting`, also as `.gltf` | the same, lossless but for rounding | +y up by the turn of a node; attributes in the user's |
 //! | `.usda`, `.usdz` | `ParticleField3DGaussianSplat`, text; also as `.usd` | the same, lossless but for rounding | +z or +y up, as the stage says |
-//! | `.html` | our own | a viewer with the splats inside, lossless | the user's |
+//! | `.html` | our own | a viewer with the splats inside, lossless | the user's, whose up it has |
 //!
 //! Files that do not fix their frame are in the user's, of which [`Frame`] knows the way up. Color that depends on the
 //! viewing direction is kept to degree 3 where the format can hold it. What a file claims is never believed: memory
@@ -203,15 +203,15 @@ fn parse_with(
     frames: Frames,
     beside: &Beside,
 ) -> Result<Loaded, FormatError> {
+    // What a comment says of up is a default: programs write it whatever the frame of their cameras was.
+    let or_up = |up: Option<DVec3>| match up.and_then(Frame::with_up) {
+        Some(up) if frames == Frames::default() => Frames::from(up),
+        _ => frames,
+    };
     let parsed = match format {
         Format::Ply => {
             let file = parse_ply(bytes, name)?;
-            // What a comment says is a default: programs write it whatever the frame of their cameras was.
-            let frames = match file.up.and_then(Frame::with_up) {
-                Some(up) if frames == Frames::default() => Frames::from(up),
-                _ => frames,
-            };
-            Ok((Decoded { splats: file.splats, frame: None, notes: file.notes }, frames))
+            Ok((Decoded { splats: file.splats, frame: None, notes: file.notes }, or_up(file.up)))
         }
         Format::Splat => splat::decode(bytes).map(|d| (d, frames)),
         Format::Spz => spz_read::decode(bytes, frames.from.is_some()).map(|d| (d, frames)),
@@ -219,7 +219,7 @@ fn parse_with(
         Format::Glb => glb_read::decode(bytes, beside).map(|d| (d, frames)),
         // Text, binary or an archive: the bytes tell.
         Format::Usda | Format::Usdz => usd_read::decode(bytes).map(|d| (d, frames)),
-        Format::Html => html::decode(bytes).map(|d| (d, frames)),
+        Format::Html => html::decode(bytes).map(|(d, up)| (d, or_up(up))),
     };
     let invalid = |problem| FormatError::Invalid { file: name.into(), problem };
     let (decoded, frames) = parsed.map_err(invalid)?;

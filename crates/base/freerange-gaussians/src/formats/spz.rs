@@ -5,11 +5,13 @@
 //! each; in version 2 `x y z` in 8 bits each), further harmonics in 8 (in 128ths, coefficient by coefficient). Versions
 //! 2 and 3 are a header of 16 bytes and these, as one gzip stream; version 4 a header of 32 bytes, extensions, a table
 //! of sizes, and one ZSTD stream per attribute. Source: github.com/nianticlabs/spz.
+//!
+//! Files of this program say that +y is up: version 4 by the extension for it, the others by the time in the gzip header.
 
 use std::io::Write;
 
 use crate::{Gaussians, RenderMode, Splats, channel};
-use flate2::{Compression, write::GzEncoder};
+use flate2::{Compression, GzBuilder};
 use ruzstd::encoding::{CompressionLevel, compress_to_vec};
 
 use crate::formats::{
@@ -29,8 +31,11 @@ pub const HEADER_4: usize = 32;
 pub const ANTIALIASED: u8 = 1;
 /// Bit of the flags: records of extensions follow.
 pub const EXTENSIONS: u8 = 2;
-/// The extension that tells the axes of the numbers.
+/// The extension that tells the axes of the numbers, and its value for those that the format defines: right, up, back.
 pub const COORDINATES: u32 = 0xadbe_0003;
+const RIGHT_UP_BACK: u32 = 4;
+/// The time in the gzip header of our files, by which they are known: a moment of 2014, before there was such a format. Readers pass it over.
+pub const OUR_TIME: u32 = u32::from_le_bytes(*b"FRGS");
 
 /// Which version of `.spz` to write.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -125,7 +130,7 @@ impl Packed {
     }
 
     fn legacy(&self, version: u32) -> Vec<u8> {
-        let mut file = GzEncoder::new(Vec::new(), Compression::best());
+        let mut file = GzBuilder::new().mtime(OUR_TIME).write(Vec::new(), Compression::best());
         let written = file.write_all(&self.header(version, self.flags, 0));
         let written = written.and_then(|()| file.write_all(&self.streams.concat())).and_then(|()| file.finish());
         written.expect("memory can be written to")
@@ -134,9 +139,11 @@ impl Packed {
     fn streamed(&self) -> Vec<u8> {
         let streams: Vec<&[u8]> = self.streams.iter().map(|s| &s[..]).filter(|s| !s.is_empty()).collect();
         let packed: Vec<Vec<u8>> = streams.iter().map(|s| compress_to_vec(*s, CompressionLevel::Fastest)).collect();
-        let mut file = self.header(4, self.flags, streams.len() as u8);
-        file.extend((HEADER_4 as u32).to_le_bytes());
+        let axes = [COORDINATES, size_of::<u32>() as u32, RIGHT_UP_BACK].map(u32::to_le_bytes).concat();
+        let mut file = self.header(4, self.flags | EXTENSIONS, streams.len() as u8);
+        file.extend(((HEADER_4 + axes.len()) as u32).to_le_bytes());
         file.resize(HEADER_4, 0);
+        file.extend(axes);
         for (stream, packed) in streams.iter().zip(&packed) {
             file.extend((packed.len() as u64).to_le_bytes());
             file.extend((stream.len() as u64).to_le_bytes());

@@ -14,7 +14,7 @@ use crate::formats::{
     bytes::{Cursor, check_expansion},
     error::problem,
     quantize::{Row, color_of_sh, from_smallest_three, logit_of_byte, set_rotation},
-    spz::{ANTIALIASED, COLOR_SCALE, COORDINATES, EXTENSIONS, HEADER_4, MAGIC},
+    spz::{ANTIALIASED, COLOR_SCALE, COORDINATES, EXTENSIONS, HEADER_4, MAGIC, OUR_TIME},
 };
 
 /// Bytes per Gaussian without spherical harmonics, at least.
@@ -86,6 +86,9 @@ pub fn decode(bytes: &[u8], told: bool) -> Result<Decoded, Invalid> {
         _ => streamed(bytes)?,
     };
     let (axes, mut notes) = extensions(&parts.extensions)?;
+    // Our own have the axes that the format defines.
+    let ours = matches!(bytes, [0x1f, 0x8b, _, _, time @ ..] if time.starts_with(&OUR_TIME.to_le_bytes()));
+    let axes = axes.or(ours.then_some(DMat3::IDENTITY));
     let mut splats = unpack(&parts.header, parts.streams.each_ref().map(|s| &s[..]))?;
     if parts.header.degree > MAX_DEGREE {
         let left = 3 * (coefficients(parts.header.degree) - coefficients(MAX_DEGREE));
@@ -96,7 +99,9 @@ pub fn decode(bytes: &[u8], told: bool) -> Result<Decoded, Invalid> {
     }
     if parts.header.flags & ANTIALIASED != 0 {
         splats.mode = RenderMode::Mip;
-        notes.push("the file is marked as made for antialiased rendering (some writers mark all of theirs)".into());
+        if !ours {
+            notes.push("the file is marked as made for antialiased rendering (some writers mark all of theirs)".into());
+        }
     }
     let frame = match axes {
         _ if told => None,

@@ -2,8 +2,6 @@
 
 use std::{
     borrow::Cow,
-    fs::File,
-    io::BufWriter,
     path::{Path, PathBuf},
 };
 
@@ -65,9 +63,10 @@ impl Whole {
     }
 }
 
-/// Fast rather than small: these files are read on the same machine.
+/// Fast rather than small: these files are read on the same machine. Written at once: a buffer that is dropped does not report a full disk.
 fn write(image: &RgbaImage, path: &Path) -> std::io::Result<()> {
-    let to = BufWriter::new(File::create(path)?);
-    let png = PngEncoder::new_with_quality(to, CompressionType::Fast, FilterType::Adaptive);
-    image.write_with_encoder(png).map_err(std::io::Error::other)
+    let mut bytes = Vec::new();
+    let png = PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive);
+    image.write_with_encoder(png).map_err(std::io::Error::other)?;
+    std::fs::write(path, bytes)
 }

@@ -2,6 +2,7 @@
 
 use std::{
     fs,
+    io::Cursor,
     ops::ControlFlow,
     path::Path,
     sync::{
@@ -16,7 +17,7 @@ use freerange_scene::camera::{
     Camera,
     image_ops::{composite, resize_area, to_picture},
 };
-use image::RgbaImage;
+use image::{ImageFormat, RgbaImage};
 
 use super::{
     Board,
@@ -218,6 +219,8 @@ fn small(width: u32, height: u32) -> (u32, u32) {
 pub(super) fn save_thumbnail(folder: &Path, picture: &RgbaImage) -> Result<(), Refusal> {
     let (w, h) = small(picture.width(), picture.height());
     let beside = folder.join("thumbnail.new.png");
-    resize_area(picture, w, h).save(&beside).map_err(Refusal::own)?;
+    let mut bytes = Cursor::new(Vec::new());
+    resize_area(picture, w, h).write_to(&mut bytes, ImageFormat::Png).map_err(Refusal::own)?;
+    fs::write(&beside, bytes.into_inner()).map_err(Refusal::own)?;
     fs::rename(&beside, thumbnail_file(folder)).map_err(Refusal::own)
 }

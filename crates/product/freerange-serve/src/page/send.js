@@ -8,7 +8,7 @@ import { app } from "./state.js";
 const OF_USE = /\.(png|jpe?g|webp|json|bin|txt|xml|csv)$/i;
 const PHOTO = /\.(png|jpe?g|webp)$/i;
 /** Gaussians, to be looked at and converted. */
-const SPLATS = /\.(ply|splat|spz|sog|glb|usd[az])$/i;
+const SPLATS = /\.(ply|splat|spz|sog|glb|usd[az]|html)$/i;
 /** Photos that nobody here can read. */
 const OTHERS = /\.(heic|heif|avif|tiff?|dng|raw|cr[23]|nef|arw|exr|mp4|mov)$/i;
 /** What has cameras, by its name. */
