@@ -78,12 +78,10 @@ fn windows_are_parts_of_views() {
             assert_eq!(windows.images[k].get_pixel(3, 7), targets.images[of].get_pixel(x as u32 + 3, y as u32 + 7));
             let part = render(cloud.rows(), &[camera], &[background], &config).unwrap();
             let all = render(cloud.rows(), &[whole], &[background], &config).unwrap();
-            for (i, found) in part.rgb.chunks(60).enumerate() {
-                let expected = &all.rgb[3 * ((y + i) * 40 + x)..][..60];
-                let off = found.iter().zip(expected).map(|(a, b)| (a - b).abs());
-                // Opacities below 1/255 are left out, which rounding decides.
-                assert!(off.clone().all(|off| off < 5e-3) && off.filter(|off| *off > 1e-4).count() <= 6, "row {i}");
-            }
+            // But for what is outside of the window by more than 0.15 of its sides, whose perspective is bounded (see `Pinhole`).
+            let expected = (0..20).flat_map(|i| &all.rgb[3 * ((y + i) * 40 + x)..][..60]);
+            let off: Vec<f32> = part.rgb.iter().zip(expected).map(|(a, b)| (a - b).abs()).collect();
+            assert!(off.iter().all(|off| *off < 0.03) && off.iter().sum::<f32>() < 1e-3 * off.len() as f32, "{off:?}");
         }
     }
     assert!(places.len() > 5, "{places:?}");
