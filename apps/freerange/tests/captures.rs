@@ -152,7 +152,7 @@ fn ring(count: usize) -> Vec<View> {
 }
 
 /// A program that finds these cameras: it stands for a Python with pycolmap. `models`: photos in each; before a bar those that it finds under
-/// masks. `before` is run first.
+/// given masks. `before` is run first.
 #[cfg(unix)]
 fn engine(folder: &Path, found: &[View], models: &str, before: &str) -> PathBuf {
     use std::os::unix::fs::PermissionsExt;
@@ -163,7 +163,7 @@ fn engine(folder: &Path, found: &[View], models: &str, before: &str) -> PathBuf 
     let (masked, models) = models.split_once('|').unwrap_or((models, models));
     let script = format!(
         "#!/bin/sh\nif [ \"$1\" = -c ]; then echo 0.0-test; exit 0; fi\n{before}\nwork=$(dirname \"$2\")\nm='{models}'\n\
-         grep -q '\"masks\": null' \"$2\" || m='{masked}'\nmkdir -p \"$work/model\"\n\
+         grep -q '\"masks\": \"[^\"]*/masks\"' \"$2\" && m='{masked}'\nmkdir -p \"$work/model\"\n\
          cp {}/sparse/0/*.bin \"$work/model/\"\necho '{{\"engine\": \"test\", \"models\": '\"$m\"', \"pairs\": \"neighbors\", \"points\": 1}}' \
          > \"$work/result.json\"\n",
         model.display()

@@ -5,6 +5,7 @@ mod colmap;
 mod engine;
 mod job;
 mod judge;
+mod moving;
 mod search;
 mod taken;
 

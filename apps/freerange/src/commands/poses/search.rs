@@ -9,7 +9,8 @@ use super::{
     engine::Engine,
     job::{Done, Job},
     judge::Judgement,
-    taken::{self, Taken, taken},
+    moving::moving,
+    taken::{self, Taken, plain_name, taken},
 };
 use crate::error::CliError;
 
@@ -91,7 +92,7 @@ impl Search<'_> {
         let mut way = Way { neighbors: NEIGHBORS, masked: self.masks.is_some() };
         let (mut done, mut judgement) = self.attempt(&photos, &names, &way, tell)?;
         if way.masked && !judgement.refused.is_empty() {
-            // The turntable itself has features, too. Those of a background that stands still are filtered.
+            // The turntable or table has features, too.
             let why = judgement.refused.join("; ");
             tell(Told::Note(format!("{why}; trying again with features beside the masks")));
             way.masked = false;
@@ -132,10 +133,11 @@ impl Search<'_> {
         };
         let work = work.map_err(CliError::failure)?;
         let masks = self.masks.map(|from| masks_again(from, photos, &work.path().join("masks"))).transpose()?;
-        let job = Job {
-            masks: masks.as_ref().filter(|_| way.masked).map(|(folder, _)| folder.clone()),
-            ..self.job(work.path(), photos, names, way.neighbors)?
+        let hidden = match masks.as_ref().filter(|_| way.masked) {
+            Some((folder, _)) => Some(folder.clone()),
+            None => moving(photos, &work.path().join("moving"))?,
         };
+        let job = Job { masks: hidden, ..self.job(work.path(), photos, names, way.neighbors)? };
         let log = self.path("poses.log")?;
         let done = self.engine.run(&job, &log, &self.bounds, &mut |what, pairs, done| {
             tell(Told::Step(what, pairs, done));
@@ -191,11 +193,6 @@ impl Search<'_> {
             seed: self.seed,
         })
     }
-}
-
-/// A photo's name without spaces, at which COLMAP's lists end names.
-fn plain_name(photo: &Path) -> String {
-    photo.file_name().unwrap_or_default().to_string_lossy().replace(char::is_whitespace, "_")
 }
 
 /// Masks as COLMAP reads them without surprises: gray, black or white, of the photo's own size, one for each photo; white where there is none.

@@ -13,6 +13,11 @@ use freerange_scene::read::in_order;
 
 use crate::error::CliError;
 
+/// A photo's name without spaces, at which COLMAP's lists end names.
+pub fn plain_name(photo: &Path) -> String {
+    photo.file_name().unwrap_or_default().to_string_lossy().replace(char::is_whitespace, "_")
+}
+
 /// What is known of a photo before its cameras are.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Taken {
