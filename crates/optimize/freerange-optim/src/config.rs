@@ -256,8 +256,8 @@ const MOST_PHOTOS: usize = 16;
 /// Up to so many pixels, the longest side, pictures grow with the number of photos.
 const MOST_GROWN: u32 = 512;
 
-/// What [`OptimizationConfig::coarse`] and [`OptimizationConfig::window`] are where detail is asked for: half the time, and the
-/// same in the end.
+/// What [`OptimizationConfig::coarse`] and [`OptimizationConfig::window`] are where detail is asked for: less time, and the same in
+/// the end.
 const COARSE: f64 = 0.6;
 const WINDOW: f64 = 0.6;
 
