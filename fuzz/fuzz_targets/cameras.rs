@@ -1,9 +1,9 @@
-//! A letter (`c`, `i`, `f`, `g` COLMAP's cameras, images, frames and rigs, binary; capitals as text; `m` Metashape, `o` OPF, `p`
-//! Polycam, `r` RealityCapture), then the file.
+//! A letter (`c`, `i`, `f`, `g` COLMAP's cameras, images, frames and rigs, binary; capitals as text; `m` Metashape, `o`, `l`, `j` OPF's
+//! calibrated cameras, list of cameras and project, `p` Polycam, `r` RealityCapture), then the file.
 //! Must end in an error or in cameras with finite numbers.
 #![no_main]
 
-use std::path::Path;
+use std::path::{Component, Path};
 
 use freerange_scene::read::{Intrinsics, colmap, colmap_frames, metashape, opf, polycam, realitycapture};
 use libfuzzer_sys::fuzz_target;
@@ -45,6 +45,13 @@ fuzz_target!(|data: &[u8]| {
         b'o' => {
             for camera in opf::calibrated(file, bytes).into_iter().flatten() {
                 assert!(camera.focal > 0.0 && camera.axes.is_finite());
+            }
+        }
+        b'l' => drop(opf::uris(file, bytes)),
+        b'j' => {
+            // What it names lies in its folder.
+            for path in opf::project(file, bytes).into_iter().flatten() {
+                assert!(path.components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir)));
             }
         }
         b'r' => {

@@ -82,6 +82,10 @@ def test_gsplats_order_and_names(scattered):
         freerange.Gaussians(*in_order).render(viewmats=viewmats[None], Ks=k[None], width=width, height=height),
     ):
         assert np.allclose(found.rgb.reshape(height, width, 3), expected.rgb, atol=1e-6)
+    black = freerange.render(*in_order, viewmats=viewmats, Ks=k, width=width, height=height, backgrounds=np.zeros((1, 3)))
+    assert np.array_equal(black.rgb, freerange.render(**given, c2w=c2w, K=k, width=width, height=height, background=0.0).rgb)
+    with pytest.raises(TypeError, match="either background or backgrounds, found both"):
+        freerange.render(*in_order, c2w=c2w, K=k, background=0.5, backgrounds=0.5)
     with pytest.raises(TypeError, match="either c2w or viewmats, found both"):
         freerange.render(*in_order, c2w=c2w, viewmats=viewmats, K=k)
     with pytest.raises(TypeError, match="either K or Ks, found none"):
@@ -186,6 +190,14 @@ def test_harmonics_are_kept(scattered, tmp_path, degree):
         color = one.colors[0] + constant * (-d[1] * sh[0] + d[2] * sh[1] - d[0] * sh[2])
         same = freerange.Gaussians(one.means, one.scales, one.quats, one.opacities, [np.maximum(color, 0.0)])
         assert np.allclose(one.render(c2w, k, width, height).rgb, same.render(c2w, k, width, height).rgb, atol=1e-5)
+    # All coefficients in one array, as gsplat has them.
+    constant = (gaussians.colors[:, None] - 0.5) / 0.28209479177387814
+    whole = freerange.Gaussians(**dict(scattered[0], colors=np.concatenate([constant, gaussians.sh], axis=1)))
+    assert np.allclose(whole.rows, gaussians.rows, atol=1e-6) and np.array_equal(whole.sh, gaussians.sh)
+    with pytest.raises(ValueError, match=r"colors: .*\[5, 2, 3\]"):
+        freerange.Gaussians(**dict(scattered[0], colors=np.zeros((5, 2, 3))))
+    with pytest.raises(TypeError, match="sh: .*both"):
+        freerange.Gaussians(**dict(scattered[0], colors=np.zeros((5, 4, 3))), sh=gaussians.sh)
     with pytest.raises(ValueError, match="sh: .*3, 8 or 15"):
         freerange.Gaussians(**scattered[0], sh=np.zeros((5, 4, 3)))
 

@@ -166,19 +166,26 @@ assert any("SIMPLE_RADIAL" in note or "distort" in note for note in scene.notes)
     assert run.returncode == 0, run.stderr
 
 
-def test_help_is_readable(model):
-    """Every public function has its arguments in its signature and in its text."""
+def test_help_is_readable():
+    """Every public function and method has its arguments in its signature and under `Args:`; classes have theirs under `Attributes:`."""
     import inspect
 
-    for function in (
-        freerange.load, freerange.render, freerange.Scene.read, freerange.Scene.from_arrays, freerange.Scene.from_pycolmap,
-        freerange.Model.reconstruct, freerange.Model.reconstruct_scene, freerange.Gaussians.__init__, freerange.Gaussians.read,
-    ):
-        text = inspect.getdoc(function)
-        for name, parameter in inspect.signature(function).parameters.items():
-            assert parameter.kind is not parameter.VAR_KEYWORD or name == "options", function
-            if name not in ("self", "cls"):
-                assert name in text, f"{function.__qualname__}: {name}"
+    found = [freerange.load, freerange.render]
+    for kind in (freerange.Gaussians, freerange.Model, freerange.Scene):
+        public = [member for name, member in inspect.getmembers(kind, callable) if not name.startswith("_")]
+        found += [getattr(member, "__func__", member) for member in public]
+    found.append(freerange.Gaussians.__init__)
+    assert len(found) > 15
+    for function in found:
+        text = inspect.getdoc(function) or ""
+        names = [name for name in inspect.signature(function).parameters if name not in ("self", "cls")]
+        kinds = {parameter.kind for parameter in inspect.signature(function).parameters.values()}
+        assert not kinds & {inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL}, function
+        told = text.partition("Args:")[2]
+        assert text and all(name in told for name in names), f"{function.__qualname__}: {names}"
+    for kind in (freerange.Gaussians, freerange.Render, freerange.Scene, freerange.Step):
+        told = inspect.getdoc(kind).partition("Attributes:")[2]
+        assert all(f"{name}: " in told for name in kind.__annotations__ if not name.startswith("_")), kind
 
 
 def test_an_exception_in_on_step_ends_the_work(model):

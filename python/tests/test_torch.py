@@ -104,6 +104,8 @@ def test_tensors_as_gsplat_takes_them(scattered):
     assert colors.shape == (5, 4, 3)
     assert np.allclose(0.5 + 0.28209479177387814 * colors[:, 0].numpy(), given["colors"], atol=1e-6)
     assert np.array_equal(colors[:, 1:].numpy(), sh)
+    again = freerange.Gaussians(**freerange.Gaussians(**given, sh=sh).to_torch())
+    assert np.array_equal(again.sh, sh) and np.allclose(again.rows, freerange.Gaussians(**made).rows, atol=1e-5)
 
 
 def test_it_can_be_optimised(scattered):

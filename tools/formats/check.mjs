@@ -4,8 +4,8 @@
 //     tools/formats/run.sh target/release/freerange
 //     node --experimental-websocket check.mjs ../../target/release/freerange [FOLDER]
 //
-// Needs Chromium ($CHROMIUM, or `chromium` on the path), and what run.sh installs. $PYTHON is the Python that has gsply, gaussforge and
-// usd-core; without it they are left out, and said so.
+// Needs Chromium ($CHROMIUM, or `chromium` on the path), and what run.sh installs. $PYTHON is the Python that has gsply, gaussforge,
+// usd-core, pycolmap and nerfstudio; without it they are left out, and said so.
 // Node 22 and later needs no option.
 import { execFileSync } from "node:child_process";
 import { existsSync, mkdirSync, mkdtempSync, readFileSync, writeFileSync } from "node:fs";
@@ -77,6 +77,25 @@ if (existsSync(python)) {
   for (const name of ["object.usda", "object.usdz"]) usd(name, read("read_usd.py", name));
 } else if (process.env.CI === "true") check("Python's readers", false, `no ${python}`);
 else console.log(`left out: gsply, gaussforge, usd-core (no ${python})`);
+
+// The COLMAP model of a result, by pycolmap and by nerfstudio's own reader, against the cameras of the scene.
+const imports = () => {
+  try {
+    run(python, "-c", "import pycolmap, nerfstudio");
+    return true;
+  } catch {
+    return false;
+  }
+};
+if (existsSync(python) && imports()) {
+  const bowl = join(here, "../../examples/bowl"), quick = ["--iterations", "0", "--set", "refine.passes=1", "--symmetry", "off"];
+  run(command, "reconstruct", bowl, "-o", file("bowl"), "--format", "colmap", ...quick);
+  const said = run(python, join(here, "read_colmap.py"), file("bowl/colmap"), join(bowl, "transforms_train.json"));
+  const found = JSON.parse(said.trim().split("\n").at(-1)), [points, theirs] = found.points;
+  const same = found.photos.every((n) => n === 4) && points === theirs && points > 1000 && found.apart < 1e-9;
+  check("pycolmap and nerfstudio read a COLMAP model", same && found.pose < 1e-5 && found.intrinsics < 1e-6, JSON.stringify(found));
+} else if (process.env.CI === "true") check("readers of COLMAP models", false, `no pycolmap and nerfstudio for ${python}`);
+else console.log(`left out: pycolmap, nerfstudio (none for ${python})`);
 
 // OpenUSD: values of the stage, in its frame (+z up here), and the box that frames it, three deviations around.
 function usd(name, found) {

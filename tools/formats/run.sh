@@ -27,6 +27,10 @@ fi
 if [ -z "${PYTHON:-}" ] && [ ! -d venv ]; then
   { python3 -m venv venv && venv/bin/pip install -q 'gsply[sogs,spz]==0.4.6' gaussforge==0.6.0 plyfile==1.1.5 usd-core==26.11; } || rm -rf venv
 fi
+if [ -d venv ] && ! venv/bin/python -c 'import pycolmap, nerfstudio' 2>/dev/null; then
+  # nerfstudio's reader of COLMAP models needs NumPy alone; what else it asks for is gigabytes.
+  { venv/bin/pip install -q pycolmap==4.2.1 && venv/bin/pip install -q --no-deps nerfstudio==1.1.5; } || true
+fi
 options=()
 node -e 'process.exit(typeof WebSocket === "undefined" ? 1 : 0)' || options+=(--experimental-websocket)
 node "${options[@]}" check.mjs "$binary"

@@ -3,9 +3,10 @@
 //
 //     node --experimental-websocket check.mjs ../../target/release/freerange
 //
-// Needs Chromium ($CHROMIUM, or `chromium` on the path). With $PICTURES, pictures of every state are written there.
+// Needs Chromium ($CHROMIUM, or `chromium` on the path). With $PICTURES, pictures of every state are written there. The first estimate has to be on the
+// page within $FIRST seconds of pressing go: two by default, since machines of CI are busy; 0.3 is the aim on an idle one.
 import { execFileSync, spawn } from "node:child_process";
-import { cpSync, mkdirSync, mkdtempSync, readFileSync, rmSync, writeFileSync } from "node:fs";
+import { cpSync, mkdirSync, mkdtempSync, readFileSync, rmSync, truncateSync, writeFileSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join, resolve } from "node:path";
 import { browser, serve } from "../formats/browser.mjs";
@@ -87,7 +88,7 @@ const SUM = "window.viewers[0].rows.reduce((sum, v, i) => sum + v * ((i % 97) + 
 try {
   await send("Emulation.setEmulatedMedia", { features: [{ name: "prefers-color-scheme", value: "light" }] });
   let bytes = 0;
-  const modules = ["main", "jobs", "job", "gaussians", "panes", "brush", "zoom", "edit", "send", "record", "gif", "dom", "state"].map((name) => `/${name}.js`);
+  const modules = ["main", "jobs", "job", "gaussians", "panes", "brush", "zoom", "edit", "send", "record", "remove", "gif", "dom", "state"].map((name) => `/${name}.js`);
   for (const path of ["/", "/style.css", "/viewer.js", ...modules]) bytes += (await get(path)).length;
   check("size of the page", bytes < 120_000, `${bytes} bytes`);
 
@@ -120,10 +121,36 @@ try {
   await accessible("at the start");
   await picture("start");
 
-  // A folder is dropped.
+  // What the server would not take is said before anything is sent. The files are large in name only.
   const [x, y] = await middle("#drop");
-  const data = { items: [], files: [bowl], dragOperationsMask: 1 };
-  for (const type of ["dragEnter", "dragOver", "drop"]) await send("Input.dispatchDragEvent", { type, x, y, data });
+  const dropped = async (file) => {
+    for (const type of ["dragEnter", "dragOver", "drop"]) await send("Input.dispatchDragEvent", { type, x, y, data: { items: [], files: [file], dragOperationsMask: 1 } });
+  };
+  for (const [name, size, words] of [["large", 513 * 2 ** 20, "takes at most 512 MB"], ["one", 65 * 2 ** 20, "takes at most 64 MB a file"], ["phone", 1, "HEIC files"]]) {
+    const place = join(folder, name), file = join(place, name === "phone" ? "a.heic" : "a.png");
+    mkdirSync(place);
+    writeFileSync(file, "");
+    truncateSync(file, size);
+    await dropped(place);
+    await until(`document.getElementById('alert').textContent.includes(${JSON.stringify(words)})`);
+    check(`refused before it is sent, ${name}`, await evaluate("location.hash") === "", await evaluate("document.getElementById('alert').textContent"));
+    rmSync(place, { recursive: true });
+  }
+
+  // A folder is dropped, over a slow line: how far it is.
+  await send("Network.enable");
+  const line = (uploadThroughput) => send("Network.emulateNetworkConditions", { offline: false, latency: 0, downloadThroughput: -1, uploadThroughput });
+  await line(30_000);
+  await dropped(bowl);
+  await until("!document.getElementById('sending').hidden && document.getElementById('sent').value > 0 && document.getElementById('sent').value < 1", 30);
+  check("how far an upload is", await evaluate("document.getElementById('sent-text').textContent.startsWith('Sent ')"), await evaluate("document.getElementById('sent-text').textContent"));
+  await accessible("while it is sent");
+  await picture("sending");
+  await click("#stop-sending");
+  await until("document.getElementById('alert').textContent === 'nothing was sent' && document.getElementById('sending').hidden");
+  check("an upload is stopped", await evaluate("location.hash") === "", await evaluate("document.getElementById('alert').textContent"));
+  await line(-1);
+  await dropped(bowl);
   await state("ready", 120);
   await until("document.querySelectorAll('#photos img.cut').length === 4 && [...document.querySelectorAll('#photos img')].every((i) => i.complete)");
   const title = await evaluate("document.getElementById('job-title').textContent");
@@ -134,9 +161,6 @@ try {
   // Photos without cameras: they are looked for, and the engine's refusal is told.
   const shared = await evaluate("location.hash"), bare = join(folder, "bare");
   cpSync(join(bowl, "train"), bare, { recursive: true });
-  const dropped = async (file) => {
-    for (const type of ["dragEnter", "dragOver", "drop"]) await send("Input.dispatchDragEvent", { type, x, y, data: { items: [], files: [file], dragOperationsMask: 1 } });
-  };
   check("what finds cameras is said", await evaluate("document.getElementById('finder').textContent.includes('pycolmap 0.0-test')"), await evaluate("document.getElementById('finder').textContent"));
   await dropped(bare);
   await until("document.getElementById('cameras-dialog').open");
@@ -151,9 +175,12 @@ try {
   await until("document.getElementById('status').textContent.startsWith('Finding the cameras')", 30);
   const searching = await evaluate("document.getElementById('status').textContent");
   check("progress of the search", !await evaluate("document.getElementById('progress').hidden || document.getElementById('cancel').hidden"), searching);
+  await picture("searching");
   await state("failed", 60);
   const refusal = await evaluate("document.getElementById('status').textContent");
   check("a refusal of the engine", refusal.includes("only 0 of 4 photos could be placed") && !refusal.includes("--"), refusal);
+  await accessible("failed");
+  await picture("failed");
   await evaluate(`location.hash = ${JSON.stringify(shared)}`);
   await state("ready", 30);
 
@@ -241,18 +268,28 @@ try {
   await until("document.activeElement.id === 'undo' && document.getElementById('job').hidden");
   check("focus after removal", true, "on Undo");
   await accessible("after removal");
+  await picture("removed");
   await click("#undo");
   await until(`location.hash === '#job=${mine}' && document.getElementById('job-title').textContent === 'a <b>bowl</b>' && document.body.dataset.state === 'ready'`);
   check("undo", true, await evaluate("document.getElementById('status').textContent"));
 
   // Go; orbit while it computes; cancel.
   const go = async () => {
-    await evaluate("document.body.dataset.estimates = '0'; window.pressed = performance.now(); document.getElementById('go').click()");
+    await evaluate(`(() => {
+      document.body.dataset.estimates = "0";
+      window.first = new Promise((done) => new MutationObserver((_, watcher) => {
+        if (!(Number(document.body.dataset.estimates) > 0)) return;
+        watcher.disconnect();
+        requestAnimationFrame(() => done(performance.now() - window.pressed));
+      }).observe(document.body, { attributeFilter: ["data-estimates"] }));
+      window.pressed = performance.now();
+      document.getElementById("go").click();
+    })()`);
     await until("Number(document.body.dataset.estimates) > 0 && window.viewers[0].count > 0", 120);
-    return evaluate("performance.now() - window.pressed");
+    return evaluate("window.first");
   };
-  const first = await go();
-  told("first estimate on the page after pressing go", `${(first / 1000).toFixed(2)} s at most (looked at 20 times a second)`);
+  const first = await go(), most = Number(process.env.FIRST ?? 2);
+  check("first estimate on the page after pressing go", first < 1000 * most, `${(first / 1000).toFixed(2)} s of ${most} s`);
   const orbit = "JSON.stringify(window.viewers[0].orbit)", before = await evaluate(orbit);
   await drag(".stage canvas", 80, 30);
   const running = await evaluate("document.body.dataset.state");
@@ -261,12 +298,15 @@ try {
   await click("#cancel");
   await state("cancelled", 10);
   check("cancel", true, `${Date.now() - pressed} ms`);
+  await accessible("cancelled");
+  await picture("cancelled");
 
   // Another one to the end.
   await go();
   const seen = new Set();
-  let shot = false;
+  let shot = false, more = "";
   while (await evaluate("document.body.dataset.state !== 'done' && document.body.dataset.state !== 'failed'")) {
+    more ||= await evaluate("/about \\d+ (s|min) left/.exec(document.getElementById('status').textContent)?.[0] ?? ''");
     seen.add(`${await evaluate("document.body.dataset.state === 'running' ? document.getElementById('status').textContent.split(':')[0] : ''")} ${await evaluate(SUM)}`);
     if (!shot && seen.size > 6) {
       await picture("running");
@@ -276,6 +316,7 @@ try {
   }
   const stages = [...new Set([...seen].map((s) => s.slice(0, s.lastIndexOf(" "))))].filter(Boolean);
   check("different estimates", seen.size >= 5, `${seen.size}, in ${stages.join(", ")}`);
+  check("time left", more !== "", more || "never told");
   await state("done", 1);
   const id = await evaluate("location.hash.slice(5)");
   await until(`document.body.dataset.result === ${JSON.stringify(id)}`);
@@ -315,6 +356,13 @@ try {
   await until(`window.viewers[0].orbit.azimuth > ${turned} + 0.02`);
   await click("#auto");
   check("turns by itself", await evaluate("document.getElementById('auto').getAttribute('aria-pressed')") === "false", "and stops");
+  // The whole screen, which a browser gives to a user's own click only.
+  await send("Runtime.evaluate", { expression: "document.getElementById('full').click()", userGesture: true });
+  await until("document.fullscreenElement?.id === 'views'", 10);
+  await picture("full-screen");
+  await evaluate("document.exitFullscreen()");
+  await until("!document.fullscreenElement", 10);
+  check("full screen", true, "and back");
 
   // Cropped, tidied, and had back.
   await evaluate("document.getElementById('edit').open = true");
@@ -416,6 +464,17 @@ try {
   await until(`document.body.dataset.result === ${JSON.stringify(id)}`);
   check("reload", true, await evaluate("document.getElementById('status').textContent"));
 
+  // Its address in another browser, which does not know the token: after the login it leads to the same object.
+  await click("#link");
+  await until("document.getElementById('alert').textContent.includes('address')");
+  const address = await evaluate("location.href");
+  await send("Network.clearBrowserCookies");
+  await chromium.open(address);
+  await until("document.querySelector('form')?.action.includes('#job=')");
+  await evaluate(`document.getElementById('token').value = ${JSON.stringify(token)}; document.querySelector('form').submit()`);
+  await until(`document.body.dataset.result === ${JSON.stringify(id)}`);
+  check("the address in another browser", await evaluate("location.href") === address, address);
+
   // Several samples, and where they differ.
   await evaluate("Object.assign(document.getElementById('samples'), { value: 2 }); Object.assign(document.getElementById('iterations'), { value: 60 }); document.getElementById('init').value = 'flow'");
   await go();
@@ -434,7 +493,7 @@ try {
   await accessible("on a phone, dark");
   await picture("phone");
   await send("Emulation.setDeviceMetricsOverride", { width: 1100, height: 850, deviceScaleFactor: 1, mobile: false });
-  const errors = chromium.errors.filter((e) => !/status of 4(04|10)/.test(e));
+  const errors = chromium.errors.filter((e) => !/status of 4(01|04|10)/.test(e));
   check("errors of the page", errors.length === 0, errors.join("; ") || "none");
 
   // Killed in the middle of a job, and started again.

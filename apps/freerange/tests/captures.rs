@@ -116,16 +116,41 @@ fn place_and_units_of_a_scene_do_not_matter() {
 #[test]
 fn warnings_of_inspect_are_told_and_kept() {
     let folder = tempfile::tempdir().unwrap();
-    let scene = folder.path().join("scene");
-    bowl(&scene, 1.0, [0.0; 3]);
-    let file = scene.join("transforms.json");
-    let mut root: Value = serde_json::from_slice(&fs::read(&file).unwrap()).unwrap();
-    root["frames"].as_array_mut().unwrap().truncate(3);
-    fs::write(&file, root.to_string()).unwrap();
-    let (report, said) = reconstructed(&scene, &folder.path().join("out"), &[]);
-    let warned = |n: &Value| n["kind"] == "warning" && n["text"].as_str().unwrap().contains("only 3 photos");
-    assert!(report["notes"].as_array().unwrap().iter().any(warned), "{}", report["notes"]);
-    assert!(said.contains("warning: only 3 photos"), "{said}");
+    let few = |name: &str, count: usize| {
+        let scene = folder.path().join(name);
+        bowl(&scene, 1.0, [0.0; 3]);
+        let file = scene.join("transforms.json");
+        let mut root: Value = serde_json::from_slice(&fs::read(&file).unwrap()).unwrap();
+        root["frames"].as_array_mut().unwrap().truncate(count);
+        fs::write(&file, root.to_string()).unwrap();
+        scene
+    };
+    // In the report, by kind, and on standard error.
+    let holds = |(report, said): &(Value, String), kind: &str, text: &str| {
+        let found = |n: &Value| n["kind"] == kind && n["text"].as_str().unwrap().contains(text);
+        assert!(report["notes"].as_array().unwrap().iter().any(found), "{text}: {}", report["notes"]);
+        let word = if kind == "warning" { "warning" } else { "note" };
+        assert!(said.lines().any(|l| l.starts_with(&format!("{word}: ")) && l.contains(text)), "{text}: {said}");
+    };
+    let alpha = reconstructed(&few("alpha", 3), &folder.path().join("alpha-out"), &[]);
+    holds(&alpha, "warning", "only 3 photos");
+    holds(&alpha, "understood", "masks are the alpha of 3 photos");
+    // From one side, with masks in files.
+    let scene = few("masked", 2);
+    fs::create_dir(scene.join("masks")).unwrap();
+    for name in ["000", "001"] {
+        let file = scene.join(format!("train/{name}.png"));
+        let mut photo = image::open(&file).unwrap().into_rgba8();
+        let (w, h) = photo.dimensions();
+        let mask = image::GrayImage::from_fn(w, h, |x, y| image::Luma([photo.get_pixel(x, y)[3]]));
+        mask.save(scene.join(format!("masks/{name}.png"))).unwrap();
+        photo.pixels_mut().for_each(|p| p[3] = 255);
+        photo.save(&file).unwrap();
+    }
+    let masked = reconstructed(&scene, &folder.path().join("masked-out"), &[]);
+    holds(&masked, "warning", "only 2 photos");
+    holds(&masked, "warning", "taken from one side");
+    holds(&masked, "understood", "masks are read from files, those of the folder masks");
 }
 
 /// A ring of photos of a striped ball, whose file is `NN.png`.
@@ -259,6 +284,100 @@ fn poses_that_an_engine_finds_are_judged() {
     assert!(code == 2 && said.contains("--uneven"), "{said}");
     let (code, said, _) = posed(folder.path(), &half, &half, "[9]", &["--uneven"]);
     assert!(code == 0 && said.contains("warning"), "{said}");
+}
+
+/// A folder with a program that stands for COLMAP 3.8: it lists its options, writes down in `calls` what it is called with, and finds these
+/// cameras.
+#[cfg(unix)]
+fn colmap(folder: &Path, found: &[View]) -> PathBuf {
+    use std::os::unix::fs::PermissionsExt;
+    let (model, programs) = (folder.join("model"), folder.join("programs"));
+    drop(fs::remove_dir_all(&model));
+    fs::create_dir_all(&programs).unwrap();
+    freerange_scene::write_colmap(&model, found, DVec3::ZERO, &[(DVec3::ZERO, [0; 3])]).unwrap();
+    let options = [
+        "--database_path --image_path --image_list_path --match_list_path --match_type --output_path --random_seed",
+        "--ImageReader.single_camera --ImageReader.camera_model --ImageReader.mask_path --SiftExtraction.use_gpu",
+        "--SiftExtraction.max_num_features --SiftExtraction.peak_threshold --SiftExtraction.estimate_affine_shape",
+        "--SiftExtraction.domain_size_pooling --SiftMatching.use_gpu --SiftMatching.guided_matching",
+        "--Mapper.min_model_size --Mapper.num_threads --Mapper.abs_pose_min_num_inliers --Mapper.init_min_tri_angle",
+        "--Mapper.init_min_num_inliers --Mapper.tri_ignore_two_view_tracks",
+    ];
+    let script = format!(
+        "#!/bin/sh\nif [ \"$1\" = help ]; then echo 'COLMAP 3.8 -- Structure-from-Motion'; exit 0; fi\n\
+         if [ \"$2\" = -h ]; then echo '{}'; exit 0; fi\necho \"$@\" >> '{}'\n[ \"$1\" = mapper ] || exit 0\n\
+         while [ \"$1\" != --output_path ]; do shift; done\nmkdir -p \"$2/0\"\ncp '{}'/sparse/0/*.bin \"$2/0/\"\n",
+        options.join(" "),
+        folder.join("calls").display(),
+        model.display()
+    );
+    let program = programs.join("colmap");
+    fs::write(&program, script).unwrap();
+    fs::set_permissions(&program, fs::Permissions::from_mode(0o755)).unwrap();
+    programs
+}
+
+#[cfg(unix)]
+#[test]
+fn colmaps_programs_are_run_with_the_options_that_they_know() {
+    let folder = tempfile::tempdir().unwrap();
+    let views = ring(16);
+    let (photos, out, calls) = (folder.path().join("photos"), folder.path().join("out"), folder.path().join("calls"));
+    fs::create_dir(&photos).unwrap();
+    views.iter().for_each(|v| v.image.save(photos.join(format!("{}.png", v.name))).unwrap());
+    // All photos by their neighbors; and some, so that all pairs are compared as well.
+    let neighbors = ["feature_extractor", "matches_importer", "mapper"];
+    let all_pairs = ["exhaustive_matcher", "mapper"];
+    for (count, more) in [(16, &all_pairs[..0]), (14, &all_pairs[..])] {
+        drop(fs::remove_file(&calls));
+        let programs = colmap(folder.path(), &views[..count]);
+        let path = format!("{}:{}", programs.display(), std::env::var("PATH").unwrap());
+        let mut command = Command::new(env!("CARGO_BIN_EXE_freerange"));
+        command.args(["poses", photos.to_str().unwrap(), "-o", out.to_str().unwrap()]).env("PATH", path);
+        let done = command.output().unwrap();
+        let said = String::from_utf8_lossy(&done.stderr);
+        assert!(done.status.success() && said.contains("16 photos, COLMAP 3.8"), "{said}");
+        assert!(said.contains("has no option matches_importer TwoViewGeometry.filter_stationary_matches"), "{said}");
+        assert_eq!(said.contains("no pose was found for 14.png, 15.png"), count == 14, "{said}");
+        let json: Value = serde_json::from_slice(&fs::read(out.join("poses.json")).unwrap()).unwrap();
+        assert_eq!((&json["engine"]["engine"], &json["engine"]["pairs"]), (&"COLMAP 3.8".into(), &"neighbors".into()));
+        assert_eq!(json["engine"]["models"], serde_json::json!([count]));
+        assert!(out.join("poses.log").is_file() && out.join("sparse/0/points3D.bin").is_file());
+        let calls = fs::read_to_string(&calls).unwrap();
+        let calls: Vec<&str> = calls.lines().collect();
+        let commands: Vec<&str> = calls.iter().filter_map(|call| call.split(' ').next()).collect();
+        assert_eq!(commands, [&neighbors[..], more].concat());
+        // One camera, weak features, neighbors first, weak poses, and runs that repeat.
+        for (call, options) in calls.iter().zip([
+            &["ImageReader.single_camera 1", "ImageReader.camera_model SIMPLE_RADIAL", "SiftExtraction.use_gpu 0"][..],
+            &["match_type pairs", "SiftMatching.use_gpu 0", "SiftMatching.guided_matching 0"],
+            &["Mapper.abs_pose_min_num_inliers 15", "Mapper.tri_ignore_two_view_tracks 0", "Mapper.num_threads 1"],
+        ]) {
+            options.iter().for_each(|o| assert!(call.contains(&format!("--{o}")), "expected {o} in: {call}"));
+        }
+        let weak = ["--SiftExtraction.peak_threshold 0.002", "--SiftExtraction.max_num_features 16384"];
+        assert!(weak.iter().all(|o| calls[0].contains(o)) && calls[2].contains("--random_seed 0"), "{calls:?}");
+    }
+}
+
+/// Photos 90 degrees apart, with a real engine: whatever it makes of them is refused.
+#[test]
+#[ignore = "needs FREERANGE_SHARED, and COLMAP or pycolmap"]
+fn eight_photos_a_quarter_turn_apart_are_refused() {
+    let shared = PathBuf::from(std::env::var_os("FREERANGE_SHARED").expect("FREERANGE_SHARED"));
+    for scene in ["bread", "mug"] {
+        let out = tempfile::tempdir().unwrap();
+        let (photos, to) = (shared.join("photos").join(scene), out.path().join("scene"));
+        let done = freerange(&["poses", photos.to_str().unwrap(), "-o", to.to_str().unwrap()]);
+        let said = String::from_utf8_lossy(&done.stderr).into_owned();
+        if said.contains("expected COLMAP on the PATH") {
+            println!("left out: neither COLMAP nor pycolmap is here");
+            return;
+        }
+        assert_eq!(done.status.code(), Some(2), "{scene}: {said}");
+        assert!(said.contains("no cameras that can be relied on") && said.contains("16 photos or more"), "{said}");
+        assert!(to.join("poses.json").is_file() && !to.join("sparse").exists(), "{scene}");
+    }
 }
 
 #[test]

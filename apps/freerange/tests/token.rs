@@ -43,6 +43,7 @@ impl Server {
     }
 }
 
+/// V3.
 #[test]
 fn a_token_is_drawn_and_printed_once() {
     let [one, other] = [0, 1].map(|_| Server::start(&mut serve()));
@@ -73,6 +74,7 @@ fn a_link_is_printed_for_each_name() {
     assert_eq!(found[1], format!("http://splats.example:{port}/?token={token}"));
 }
 
+/// V7.
 #[test]
 fn a_token_of_ones_own_is_not_printed() {
     let folder = tempfile::tempdir().unwrap();
@@ -88,6 +90,7 @@ fn a_token_of_ones_own_is_not_printed() {
     }
 }
 
+/// V7.
 #[test]
 fn what_is_not_safe_is_refused() {
     let folder = tempfile::tempdir().unwrap();

@@ -15,6 +15,8 @@ Up = Union[str, tuple[float, float, float]]
 
 Convention = Literal["opencv", "opengl"]
 CONVENTIONS = ("opencv", "opengl")
+# Value of the spherical harmonic of degree 0.
+SH_CONSTANT = 0.28209479177387814
 # OpenGL's cameras have y up and z backward.
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -103,6 +105,27 @@ def gaussians(
         shaped("opacities", opacities, (n,), f"[{n}]"),
         shaped("colors", colors, (n, 3), f"[{n}, 3]"),
     )
+
+
+def coefficients(colors: Any, sh: Any) -> tuple[Any, Any]:
+    """Colors and harmonics apart, also where `colors` holds all coefficients."""
+    if np.ndim(colors) != 3:
+        return colors, sh
+    if sh is not None:
+        raise wrong_type("sh", "none beside colors of the shape [n, k, 3]", "both")
+    found = array("colors", colors)
+    if found.shape[1:] not in ((1, 3), (4, 3), (9, 3), (16, 3)):
+        raise refuse("colors", "the shape [n, 3], or [n, k, 3] with k of 1, 4, 9 or 16", list(found.shape))
+    return 0.5 + SH_CONSTANT * found[:, 0], found[:, 1:]
+
+
+def background_given(background: Any, backgrounds: Any) -> Any:
+    """The background, under one of its two names."""
+    if backgrounds is None:
+        return background
+    if not (isinstance(background, float) and background == 1.0):
+        raise wrong_type("background", "either background or backgrounds", "both")
+    return backgrounds
 
 
 def harmonics(value: Any, n: int) -> Floats | None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from os import PathLike
-from typing import Any
+from typing import Any, final
 
 _Camera = tuple[int, int, tuple[float, ...], list[list[float]]]
 _View = tuple[str, _Camera, bytes]
@@ -14,6 +14,23 @@ _Splats = tuple[bytearray, int, bytearray]
 _Result = tuple[list[bytearray], tuple[float, float, float], _Notes, list[tuple[str, float]]]
 _Up = str | tuple[float, float, float]
 _OnStep = Callable[[str, int, int, int, float | None, bytearray | None], None]
+
+__all__ = [
+    "Model",
+    "Rendered",
+    "Scene",
+    "__version__",
+    "devices",
+    "load",
+    "rasterize",
+    "read_gaussians",
+    "read_scene",
+    "reference",
+    "scene_of_views",
+    "seen_from",
+    "transform",
+    "write_gaussians",
+]
 
 __version__: str
 
@@ -41,6 +58,7 @@ def rasterize(
 ) -> Rendered: ...
 def reference(rows: bytes, raw: _Camera, background: tuple[float, float, float]) -> tuple[bytearray, bytearray]: ...
 
+@final
 class Model:
     @property
     def device(self) -> str: ...
@@ -61,11 +79,13 @@ class Model:
     ) -> _Result: ...
     def reconstruct_scene(self, scene: Scene, chosen: dict[str, Any], on_step: _OnStep | None) -> _Result: ...
 
+@final
 class Scene:
     def views(self) -> list[_Told]: ...
     def further(self) -> list[_Told]: ...
     def notes(self) -> _Notes: ...
 
+@final
 class Rendered:
     def rgb(self) -> bytearray: ...
     def alpha(self) -> bytearray: ...

@@ -38,13 +38,16 @@ def heed(notes: Iterable[tuple[bool, str]]) -> list[str]:
 
 
 class Render(NamedTuple):
-    """Images of Gaussians: arrays of NumPy or tensors of PyTorch, as the Gaussians were. Without `v` for a single camera."""
+    """Images of Gaussians: arrays of NumPy or tensors of PyTorch, as the Gaussians were. Without `v` for a single camera.
 
-    #: Color over the background, `[v, h, w, 3]`, sRGB-encoded, not clamped.
+    Attributes:
+        rgb: color over the background, `[v, h, w, 3]`, sRGB-encoded, not clamped.
+        alpha: 1 - transmittance, `[v, h, w]`.
+        depth: mean camera z of what is seen, `[v, h, w]`, in the cameras' units; 0 where nothing is. None unless asked for.
+    """
+
     rgb: Any
-    #: 1 - transmittance, `[v, h, w]`.
     alpha: Any
-    #: Mean camera z of what is seen, `[v, h, w]`, in the cameras' units; 0 where nothing is. None unless asked for.
     depth: Any = None
 
 
@@ -59,19 +62,21 @@ class Gaussians:
     Every array is new, contiguous and `float32`, for you to keep: NumPy's and everybody else's who speaks DLPack
     (`torch.from_dlpack(g.means)` copies nothing). What you change in them does not change these Gaussians: make others
     of them, `Gaussians(means, scales, quats, opacities, colors)`.
+
+    Attributes:
+        up: the direction of up in their frame: files that fix their own (.glb, .spz) are turned by it.
+        notes: what was understood of the photos or of the file, for you to read.
+        seconds: seconds per stage of what made them.
+        seed: what they were drawn with, if they are a sample.
     """
 
     __slots__ = ("_rows", "_sh", "notes", "seconds", "seed", "up")
 
     _rows: Floats
     _sh: Floats
-    #: The direction of up in their frame: files that fix their own (.glb, .spz) are turned by it.
     up: tuple[float, float, float]
-    #: What was understood of the photos or of the file, for you to read.
     notes: list[str]
-    #: Seconds per stage of what made them.
     seconds: dict[str, float]
-    #: What they were drawn with, if they are a sample.
     seed: int | None
 
     def __init__(
@@ -92,13 +97,15 @@ class Gaussians:
             scales: `[n, 3]`, standard deviations, above 0.
             quats: `[n, 4]`, rotations w x y z of any length. `scales` and `quats` may be exchanged, as gsplat has them.
             opacities: `[n]`, from 0 to 1.
-            colors: `[n, 3]`, sRGB-encoded, mostly from 0 to 1.
+            colors: `[n, 3]`, sRGB-encoded, mostly from 0 to 1. Or `[n, 1 + k, 3]`, all coefficients of spherical harmonics, as
+                gsplat has them and `to_torch` gives them.
             sh: `[n, k, 3]` with k of 3, 8 or 15, spherical harmonics of degree 1 to 3 (gsplat's `shN`); none by default.
             up: the direction of up in their frame.
 
         Raises:
             ValueError, TypeError: the field, what was expected and what was found.
         """
+        colors, sh = _check.coefficients(colors, sh)
         means, scales, quats, opacities, colors = _check.gaussians(means, scales, quats, opacities, colors)
         n = len(means)
         if n and not scales.min() > 0.0:
@@ -154,7 +161,15 @@ class Gaussians:
 
     @classmethod
     def from_rows(cls, rows: Any, *, up: Any = (0.0, 0.0, 1.0)) -> Gaussians:
-        """Of rows as `rows` gives them."""
+        """Makes Gaussians of rows.
+
+        Args:
+            rows: `[n, 14]`, as the property `rows` has them.
+            up: the direction of up in their frame.
+
+        Raises:
+            ValueError, TypeError: the field, what was expected and what was found.
+        """
         found = _check.shaped("rows", rows, (None, CHANNELS), f"[n, {CHANNELS}]")
         made = cls.__new__(cls)
         made._set(np.array(found, dtype=np.float32), up=_check.point("up", up))
@@ -168,6 +183,9 @@ class Gaussians:
             path: the file.
             up: the direction of up in the frame that you want. Formats that fix theirs, as .glb, are turned into it.
 
+        Raises:
+            ValueError, OSError: the file, what was expected and what was found.
+
         Warns:
             DroppedWarning: something of the file is left out.
         """
@@ -177,7 +195,11 @@ class Gaussians:
 
     @classmethod
     def concat(cls, parts: Iterable[Gaussians]) -> Gaussians:
-        """All of several, one after the other, in the frame of the first. Harmonics get the highest degree of all."""
+        """All of several, one after the other, in the frame of the first. Harmonics get the highest degree of all.
+
+        Args:
+            parts: one or more.
+        """
         listed = list(parts)
         if not listed:
             raise _check.refuse("parts", "one or more Gaussians", "none")
@@ -208,14 +230,25 @@ class Gaussians:
         return Gaussians.concat([self, other]) if isinstance(other, Gaussians) else NotImplemented
 
     def crop(self, low: Any, high: Any) -> Gaussians:
-        """Those whose centers lie in the box from `low` to `high`, each `[3]`, in their frame."""
+        """Those whose centers lie in a box.
+
+        Args:
+            low, high: `[3]`, corners of the box in their frame.
+        """
         least, most = np.array(_check.point("low", low)), np.array(_check.point("high", high))
         if not (least < most).all():
             raise _check.refuse("high", f"a corner above low, {least.tolist()}", most.tolist())
         return self[((self._rows[:, 0:3] >= least) & (self._rows[:, 0:3] <= most)).all(axis=1)]
 
     def transform(self, matrix: Any) -> Gaussians:
-        """Moved by a similarity, `[4, 4]` or `[3, 4]`: a rotation times a scale, and a translation. Harmonics and up turn with them."""
+        """Moved by a similarity. Harmonics and up turn with them.
+
+        Args:
+            matrix: `[4, 4]` or `[3, 4]`, a rotation times a scale, and a translation.
+
+        Raises:
+            ValueError: it mirrors, shears or stretches.
+        """
         scale, rotation, quat, translation = _check.similarity("matrix", matrix)
         moved = Gaussians._of_splats(_core.transform(*self._splats(), scale, quat, translation))
         made = self._like(moved._rows, moved._sh)
@@ -228,13 +261,17 @@ class Gaussians:
 
         `gsplat.rasterization(**g.to_torch("cuda"), viewmats=..., Ks=..., width=..., height=...)` draws them. With spherical
         harmonics `colors` holds all coefficients, `[n, 1 + k, 3]`: give `sh_degree=g.sh_degree` as well.
+        `Gaussians(**tensors)` makes Gaussians of them again; PyTorch must be there.
+
+        Args:
+            device: of the tensors, as PyTorch names it.
         """
         import torch
 
         colors = self.colors
         if self.sh_degree:
-            # gsplat, as 3DGS, adds 0.5 to what the constant 0.282 of degree 0 gives.
-            constant = (colors[:, None] - np.float32(0.5)) / np.float32(0.28209479177387814)
+            # gsplat, as 3DGS, adds 0.5 to what the constant of degree 0 gives.
+            constant = (colors[:, None] - np.float32(0.5)) / np.float32(_check.SH_CONSTANT)
             colors = np.concatenate([constant, self._sh], axis=1)
         fields = {"means": self.means, "quats": self.quats, "scales": self.scales}
         fields |= {"opacities": self.opacities, "colors": colors}
@@ -296,6 +333,12 @@ class Gaussians:
     def save(self, path: str | PathLike[str]) -> None:
         """Writes .ply, .splat, .spz, .sog, .glb, .usda, .usdz or .html (a page that shows them), by the extension.
 
+        Args:
+            path: the file.
+
+        Raises:
+            ValueError, OSError: no format has this extension, or the file cannot be written.
+
         Warns:
             DroppedWarning: the format cannot hold something, a sentence each.
         """
@@ -311,14 +354,24 @@ class Gaussians:
         *,
         viewmats: Any = None,
         Ks: Any = None,
+        backgrounds: Any = None,
         convention: Convention = "opencv",
         depth: bool = False,
     ) -> Render:
         """Images of them, `float32` arrays; color follows the viewing direction where there are spherical harmonics.
 
-        Args: as `freerange.render`, without the Gaussians' own arrays.
+        Args:
+            c2w, K, width, height, background, viewmats, Ks, convention, depth: as `freerange.render` has them.
+            backgrounds: the same as `background`, gsplat's name.
+
+        Returns:
+            A `Render`.
+
+        Raises:
+            ValueError, TypeError: the field, what was expected and what was found.
         """
         poses, k = _check.cameras_given(c2w, viewmats, K, Ks, "K")
+        background = _check.background_given(background, backgrounds)
         return _render(self, poses, k, width, height, background, convention, depth)
 
 
@@ -392,6 +445,7 @@ def render(
     *,
     viewmats: Any = None,
     Ks: Any = None,
+    backgrounds: Any = None,
     convention: Convention = "opencv",
     depth: bool = False,
 ) -> Render:
@@ -402,20 +456,25 @@ def render(
 
     Args:
         means, scales, quats, opacities, colors: as `Gaussians` has them; gsplat's order (means, quats, scales, ...) is
-            known by the shapes.
+            known by the shapes. The sixth argument is `c2w` in either order: give gsplat's cameras by name.
         c2w: camera to world, `[4, 4]` or `[v, 4, 4]`; a fourth row may be left out. OpenCV's axes: x right, y down, z forward.
         K: `[3, 3]` or `[v, 3, 3]`, in pixels; the center of the first pixel is at 0.5.
         width, height: in pixels.
-        background: a number, a color `[3]`, or one for each view.
+        background: a number, a color `[3]`, or one for each view; white by default.
         viewmats: world to camera instead of `c2w`, as gsplat has it.
         Ks: the same as `K`.
+        backgrounds: the same as `background`, gsplat's name.
         convention: "opengl" for OpenGL's and Blender's axes (y up, z backward).
         depth: whether the depth is computed.
+
+    Returns:
+        A `Render`.
 
     Raises:
         ValueError, TypeError: the field, what was expected and what was found.
     """
     poses, k = _check.cameras_given(c2w, viewmats, K, Ks, "K")
+    background = _check.background_given(background, backgrounds)
     torch = sys.modules.get("torch")
     if torch is not None and any(isinstance(a, torch.Tensor) for a in (means, scales, quats, opacities, colors, background)):
         from .torch import render as differentiable

@@ -23,20 +23,23 @@ Precision = Literal["f32", "bf16", "f16", "auto"]
 
 @dataclass(frozen=True)
 class Step:
-    """How far a reconstruction has come."""
+    """How far a reconstruction has come.
 
-    #: "canonicalize", "symmetry", "propose", "refine" or "optimize", in this order; the last three for each sample.
+    Attributes:
+        stage: "canonicalize", "symmetry", "propose", "refine" or "optimize", in this order; the last three for each sample.
+        sample: which of the samples is worked on, from 0.
+        done: steps of the stage that are done; 0 when it begins.
+        total: all its steps.
+        loss: the photometric loss of the last step of a fit or of the optimization.
+        gaussians: the Gaussians by now, in your cameras' frame; None when a stage begins, in "symmetry", and while other
+            proposals than the first are worked on.
+    """
+
     stage: str
-    #: Which of the samples is worked on, from 0.
     sample: int
-    #: Steps of the stage that are done; 0 when it begins.
     done: int
-    #: All its steps.
     total: int
-    #: The photometric loss of the last step of a fit or of the optimization.
     loss: float | None
-    #: The Gaussians by now, in your cameras' frame; none when a stage begins, in "symmetry", and while other proposals than the
-    #: first are worked on.
     gaussians: Gaussians | None
 
 
@@ -262,6 +265,16 @@ class Model:
         Args:
             scene: a `Scene`, or what `Scene.read` reads.
             seed, quality, iterations, symmetry, init, precision, network_views, set, on_step: as `reconstruct`.
+
+        Returns:
+            Gaussians in the cameras' frame; a list of them where `seed` is several.
+
+        Raises:
+            ValueError, TypeError, OSError: the file or field, what was expected and what was found.
+            RuntimeError: a device or the arithmetic failed.
+
+        Warns:
+            DroppedWarning: something of the scene is left out, or may make the result wrong.
         """
         seeds, chosen = _options(seed, quality, iterations, symmetry, init, precision, network_views, set)
         if not isinstance(scene, Scene):

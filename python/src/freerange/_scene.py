@@ -24,20 +24,22 @@ class Scene:
 
     Made by `Scene.read` from a folder, `Scene.from_arrays` from arrays, `Scene.from_pycolmap` from a reconstruction in memory;
     `Model.reconstruct_scene` takes it.
+
+    Attributes:
+        names: names of the photos.
+        images: `uint8 [h, w, 4]` each; alpha is the object's mask.
+        intrinsics: `[v, 3, 3]`, in pixels; the center of the first pixel is at 0.5.
+        c2w: `[v, 4, 4]`, camera to world, OpenCV's axes (x right, y down, z forward).
+        further: the same four of photos that are only compared with, if the scene has such.
+        notes: what was understood, for you to read.
     """
 
     _scene: _core.Scene
-    #: Names of the photos.
     names: list[str]
-    #: `uint8 [h, w, 4]` each; alpha is the object's mask.
     images: list[Array]
-    #: `[v, 3, 3]`, in pixels; the center of the first pixel is at 0.5.
     intrinsics: Array
-    #: `[v, 4, 4]`, camera to world, OpenCV's axes (x right, y down, z forward).
     c2w: Array
-    #: The same four of photos that are only compared with, if the scene has such.
     further: tuple[list[str], list[Array], Array, Array]
-    #: What was understood, for you to read.
     notes: list[str]
 
     def __init__(self) -> None:
@@ -112,11 +114,14 @@ class Scene:
         """Makes a scene of arrays, and cuts the object out.
 
         Args:
-            names: of the views, for messages; `images[0]` and so on by default.
             images, intrinsics, c2w, masks, viewmats, Ks, convention, up, center, radius: as `Model.reconstruct`.
+            names: of the views, for messages; `images[0]` and so on by default.
 
         Raises:
             ValueError, TypeError: the field, what was expected and what was found.
+
+        Warns:
+            DroppedWarning: something given is left out, or may make the result wrong.
         """
         poses, k = _check.cameras_given(c2w, viewmats, intrinsics, Ks, "intrinsics")
         rgba = _check.images(images, masks)
@@ -131,17 +136,31 @@ class Scene:
         return cls._of(_core.scene_of_views(views, _check.up(up), center, radius))
 
     @classmethod
-    def from_pycolmap(cls, reconstruction: Any, images: str | PathLike[str], **options: Any) -> Scene:
+    def from_pycolmap(
+        cls,
+        reconstruction: Any,
+        images: str | PathLike[str],
+        *,
+        masks: Masks | str | PathLike[str] = "auto",
+        invert_masks: bool = False,
+        up: Any = "auto",
+        center: Any = None,
+        radius: float | None = None,
+        max_side: int = 1024,
+    ) -> Scene:
         """Makes a scene of a `pycolmap.Reconstruction`: all camera models, with their distortion.
 
         Args:
             reconstruction: cameras and poses, in memory.
             images: the folder of the photos, by the names that the reconstruction has.
-            options: as `Scene.read` has them.
+            masks, invert_masks, up, center, radius, max_side: as `Scene.read` has them.
 
         Raises:
             TypeError: it is no reconstruction.
             ValueError, OSError: as `Scene.read`.
+
+        Warns:
+            DroppedWarning: something of the scene is left out, or may be wrong.
         """
         if not hasattr(reconstruction, "write"):
             raise _check.wrong_type("reconstruction", "a pycolmap.Reconstruction", type(reconstruction).__name__)
@@ -149,7 +168,17 @@ class Scene:
             model = Path(folder) / "sparse" / "0"
             model.mkdir(parents=True)
             reconstruction.write(str(model))
-            return cls.read(folder, images=images, cameras="colmap", **options)
+            return cls.read(
+                folder,
+                masks=masks,
+                invert_masks=invert_masks,
+                up=up,
+                center=center,
+                radius=radius,
+                max_side=max_side,
+                images=images,
+                cameras="colmap",
+            )
 
     @classmethod
     def _of(cls, scene: _core.Scene) -> Scene:

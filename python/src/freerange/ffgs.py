@@ -29,7 +29,7 @@ except ImportError as error:
 
 from . import _check
 from ._gaussians import Gaussians
-from ._model import load
+from ._model import Quality, load
 
 __all__ = ["SPEC", "FreeRange", "FreeRangeConfig", "FreeRangeProcessor", "pipeline"]
 
@@ -41,7 +41,7 @@ class FreeRange(torch.nn.Module, PyTorchModelHubMixin):
         self,
         checkpoint: str | None = None,
         device: str = "auto",
-        quality: str = "default",
+        quality: Quality = "default",
         iterations: int | None = None,
         seed: int = 0,
     ) -> None:
@@ -81,17 +81,14 @@ class FreeRangeProcessor(Processor):
     config_cls = FreeRangeConfig
     camera_input = "required"
 
-    def preprocess(self, views: Views, device: torch.device, masks: Any = None, **options: Any) -> Prepared:
+    def preprocess(self, views: Views, device: torch.device, masks: Any = None) -> Prepared:
         """Views, with masks where there are any.
 
         Args:
             views: images with cameras.
             device: not used; the model has its own.
             masks: `[v, h, w]` or `[b, v, h, w]`, white is the object.
-            options: none are known.
         """
-        if options:
-            raise TypeError(f"{', '.join(options)}: expected no options but masks")
         views.require("intrinsics", "c2w", by="freerange")
         images = views.images.permute(0, 1, 3, 4, 2).cpu().float().numpy()  # [b, v, h, w, 3]
         poses = views.c2w.cpu().double().numpy()
@@ -145,11 +142,20 @@ class FreeRangeProcessor(Processor):
 SPEC = ModelSpec("freerange", FreeRange, FreeRangeProcessor, display_name="free-range")
 
 
-def pipeline(*, up: Any = "z", **options: Any) -> GSPipeline:
+def pipeline(
+    *,
+    up: Any = "z",
+    checkpoint: str | None = None,
+    device: str = "auto",
+    quality: Quality = "default",
+    iterations: int | None = None,
+    seed: int = 0,
+) -> GSPipeline:
     """A pipeline of ffgs.
 
     Args:
         up: which way is up in the frame of the cameras.
-        options: as `FreeRange` has them.
+        checkpoint, device, quality, iterations, seed: as `FreeRange` has them.
     """
-    return GSPipeline(FreeRange(**options), FreeRangeProcessor(up=up), SPEC.model_type)
+    model = FreeRange(checkpoint=checkpoint, device=device, quality=quality, iterations=iterations, seed=seed)
+    return GSPipeline(model, FreeRangeProcessor(up=up), SPEC.model_type)

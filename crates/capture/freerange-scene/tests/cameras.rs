@@ -1,9 +1,10 @@
-//! Readers of cameras against files and numbers of other programs (`tools/camera_vectors.py`), and against broken files.
+//! Readers of cameras against files and numbers of other programs (`tools/camera_vectors.py`, `opf_vectors.py`, `nerfstudio_vectors.py`), and
+//! against broken files.
 
 use freerange_scene::camera::{Camera, Lens};
 use freerange_scene::{
     Note, NoteKind, SceneError,
-    read::{Format, Intrinsics, Turntable, cameras, colmap, metashape, opf, polycam, realitycapture},
+    read::{Format, Intrinsics, Photo, Turntable, cameras, colmap, metashape, opf, polycam, realitycapture},
 };
 use glam::{DMat3, DVec2, DVec3};
 use serde_json::{Value, json};
@@ -378,15 +379,105 @@ fn metashape_is_read() {
         metashape::parse(file, xml.replace(from, to).as_bytes())
     };
     says(bad("<b1>3</b1>", "<b2>1</b2>"), &["x.xml", "sensor \"0\"", "`b2`", "not supported"]);
-    says(bad("type=\"frame\"><res", "type=\"fisheye\"><res"), &["sensor type fisheye"]);
+    for kind in ["fisheye", "spherical"] {
+        says(bad("type=\"frame\"><res", &format!("type=\"{kind}\"><res")), &[&format!("sensor type {kind}")]);
+    }
     says(bad("<f>500</f>", "<f>wide</f>"), &["`f`", "wide"]);
     says(bad("sensor_id=\"0\"", "sensor_id=\"7\""), &["camera \"a.b.png\"", "`sensor_id`", "7"]);
     says(bad("</transform>", " 1</transform>"), &["16 numbers", "17"]);
-    says(bad("<b1>3</b1>", "<p3>1</p3>"), &["x.xml", "sensor \"0\"", "`p3`", "not supported"]);
+    for name in ["p3", "p4"] {
+        let text = format!("<{name}>1</{name}>");
+        says(bad("<b1>3</b1>", &text), &["x.xml", "sensor \"0\"", &format!("`{name}`"), "not supported"]);
+    }
     says(bad("<transform>", "<transform>x"), &["camera", "`transform`"]);
     says(bad("</document>", "</documen>"), &["not XML"]);
     says(bad("<chunk label", "<chunk/><chunk label"), &["one chunk", "2"]);
     says(metashape::parse(file, b"<!DOCTYPE a [<!ENTITY b \"c\">]><a>&b;</a>"), &["not XML"]);
+}
+
+/// The same camera and lens, where the world of the first has each point of the other's at `moved`.
+#[track_caller]
+fn assert_same(photo: &Photo, other: &Photo, moved: impl Fn(DVec3) -> DVec3) {
+    let size = image::image_dimensions(&other.image).unwrap();
+    let (theirs, ours) = (photo.camera(size).unwrap(), other.camera(size).unwrap());
+    let numbers = |c: &Camera| [c.fx, c.fy, c.cx, c.cy];
+    for (a, b) in numbers(&theirs).into_iter().zip(numbers(&ours)) {
+        assert!((a - b).abs() < 1e-9, "{}: {a} {b}", other.name);
+    }
+    assert_eq!(photo.lens, other.lens, "{}", other.name);
+    for p in [DVec3::ZERO, DVec3::new(0.5, -0.3, 0.2), DVec3::new(-7.0, 4.0, 6.0)] {
+        let (a, b) = (theirs.world_to_camera.transform_point3(moved(p)), ours.world_to_camera.transform_point3(p));
+        assert!(a.distance(b) < 1e-9, "{}: {p} at {a} and {b}", other.name);
+    }
+}
+
+#[test]
+fn scenes_that_nerfstudio_makes_of_colmaps_are_read() {
+    let expected = expected();
+    let mut compared = 0;
+    for entry in std::fs::read_dir(freerange_vectors::path("nerfstudio/colmap")).unwrap() {
+        let file = entry.unwrap().path();
+        let folder = colmap_scene(file.file_stem().unwrap().to_str().unwrap(), "bin");
+        for name in expected["rig"].as_object().unwrap().keys() {
+            image::RgbImage::new(640, 480).save(folder.path().join("images").join(name)).unwrap();
+        }
+        std::fs::copy(&file, folder.path().join("transforms.json")).unwrap();
+        let read = |format: Format| cameras(folder.path(), Some(format), None).unwrap();
+        let (theirs, ours) = (read(Format::Transforms), read(Format::Colmap));
+        assert_eq!((theirs.photos.len(), theirs.any_up), (ours.photos.len(), true), "{}", file.display());
+        for photo in &theirs.photos {
+            let other = ours.photos.iter().find(|p| p.image.file_name() == photo.image.file_name()).unwrap();
+            // COLMAP's axes, exchanged.
+            assert_same(photo, other, |p| DVec3::new(p.x, p.z, -p.y));
+            compared += 1;
+        }
+    }
+    // Eight models of one camera, and a rig of two.
+    assert_eq!(compared, 8 * 3 + 4);
+}
+
+#[test]
+fn exports_become_what_nerfstudio_makes_of_them() {
+    type Moved = fn(DVec3) -> DVec3;
+    let cases: [(Format, Moved); 3] = [
+        (Format::Realitycapture, |p| p),
+        (Format::Polycam, |p| p),
+        // The axes z, x, y of Metashape's world.
+        (Format::Metashape, |p| DVec3::new(p.z, p.x, p.y)),
+    ];
+    for (format, moved) in cases {
+        let place = freerange_vectors::path("nerfstudio").join(format.name());
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| {
+            let path = folder.path().join(name);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            path
+        };
+        for i in 1..=3 {
+            let (w, h) = if i == 3 && format != Format::Metashape { (480, 640) } else { (640, 480) };
+            let black = image::RgbImage::new(w, h);
+            if format == Format::Polycam {
+                black.save(at(&format!("images/frame_{i:05}.png"))).unwrap();
+                black.save(at(&format!("keyframes/images/{i}.png"))).unwrap();
+                let file = format!("cameras/{i}.json");
+                std::fs::copy(place.join(&file), at(&format!("keyframes/{file}"))).unwrap();
+            } else {
+                black.save(at(&format!("images/{i}.png"))).unwrap();
+            }
+        }
+        for name in ["transforms.json", "cameras.csv", "cameras.xml"] {
+            if place.join(name).is_file() {
+                std::fs::copy(place.join(name), at(name)).unwrap();
+            }
+        }
+        let read = |format: Format| cameras(folder.path(), Some(format), None).unwrap();
+        let (theirs, ours) = (read(Format::Transforms), read(format));
+        assert_eq!((theirs.photos.len(), ours.photos.len()), (3, 3), "{format:?}");
+        assert_eq!((theirs.any_up, ours.any_up), (format == Format::Metashape, format == Format::Metashape));
+        for (photo, other) in theirs.photos.iter().zip(&ours.photos) {
+            assert_same(photo, other, moved);
+        }
+    }
 }
 
 #[test]
@@ -463,6 +554,7 @@ fn opf_is_read_as_pyopf_writes_it() {
     let file = Path::new("c.json");
     for (from, to, words) in [
         ("\"perspective\"", "\"spherical\"", ["sensor type spherical", "not supported"]),
+        ("\"perspective\"", "\"fisheye\"", ["sensor type fisheye", "not supported"]),
         ("500.0", "-1", ["`focal_length_px`", "above 0"]),
         ("\"sensor_id\": 7", "\"sensor_id\": 8", ["`sensor_id`", "8"]),
         ("35.0", "null", ["camera 1", "`orientation_deg`"]),
@@ -471,7 +563,22 @@ fn opf_is_read_as_pyopf_writes_it() {
         assert!(text.contains(from), "{from}");
         says(opf::calibrated(file, text.replace(from, to).as_bytes()), &words);
     }
+    // Names of files are URIs: with escapes, and from another machine's root on.
+    let uris = std::fs::read_to_string(at("camera_list.json")).unwrap();
+    for (uri, name) in [("images/photo%20%C3%A4.jpg", "photo \u{e4}.jpg"), ("file:///D:/job/100%.jpg", "100%.jpg")] {
+        assert!(uris.contains("images/0.jpg"));
+        std::fs::write(at("camera_list.json"), uris.replace("images/0.jpg", uri)).unwrap();
+        image::RgbImage::new(640, 480).save(at(&format!("images/{name}"))).unwrap();
+        let found = cameras(folder.path(), None, None).unwrap();
+        assert_eq!((found.photos.len(), found.photos[0].image.file_name().unwrap().to_str()), (3, Some(name)));
+    }
+    let twice = uris.replace("\"id\": 11", "\"id\": 10");
+    assert_ne!(twice, uris);
+    says(opf::uris(file, twice.as_bytes()), &["camera 1", "`id`", "of its own", "10"]);
+    says(opf::uris(file, b"{\"cameras\": [{\"id\": 1}]}"), &["camera 0", "`uri`", "null"]);
+    std::fs::write(at("camera_list.json"), &uris).unwrap();
     let project = std::fs::read_to_string(at("project.opf")).unwrap();
+    says(opf::project(file, b"{\"items\": []}"), &["`application/opf-calibrated-cameras+json`", "one resource"]);
     std::fs::write(at("project.opf"), project.replace("calibrated_cameras.json", "../c.json")).unwrap();
     says(cameras(folder.path(), None, None), &["`uri`", "../c.json"]);
 }

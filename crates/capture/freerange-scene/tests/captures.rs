@@ -1,16 +1,19 @@
 //! Captures as users have them: for each kind of fault that other programs' files had, files with it, and what they must come to.
 
-use freerange_scene::camera::{Camera, Lens, View};
+use freerange_scene::camera::{Camera, Lens, View, canonical_from_user};
 use freerange_scene::{
-    LoadConfig, Loaded, MaskKind, MaskSource, Note, NoteKind, SceneError,
+    LoadConfig, Loaded, MaskKind, MaskSource, Note, NoteKind, Scene, SceneConfig, SceneError,
     estimate::Hints,
     load,
     read::{Cameras, Format, cameras},
 };
-use glam::{DMat3, DMat4, DVec3, DVec4};
+use glam::{DMat3, DMat4, DQuat, DVec3, DVec4};
 use image::{GrayImage, ImageEncoder, Luma, Rgb, RgbImage, Rgba, RgbaImage};
 use serde_json::{Value, json};
-use std::path::{Path, PathBuf};
+use std::{
+    collections::HashMap,
+    path::{Path, PathBuf},
+};
 use tempfile::TempDir;
 
 const W: u32 = 96;
@@ -172,8 +175,14 @@ fn rims_of_undistorted_photos_are_no_backdrop_and_no_object() {
             }
             image.save(capture.at(name)).unwrap();
         }
-        capture.describe(&ring(), json!({}));
-        assert_right(&capture.load().unwrap(), 4);
+        capture.describe(&ring(), json!({"train_filenames": &NAMES[..3]}));
+        let loaded = capture.load().unwrap();
+        assert_eq!((loaded.masks, loaded.further.len()), (MaskKind::Plain, 1));
+        assert_right(&loaded, 3);
+        if rim[3] == 0 {
+            tells(&loaded.notes, NoteKind::Assumed, &["rim of 3 photos is what undistorting them left"]);
+            tells(&loaded.notes, NoteKind::Assumed, &["rim of 1 photos to compare with is what"]);
+        }
     }
 }
 
@@ -210,6 +219,7 @@ fn transparency_that_is_no_outline_is_not_taken_for_one() {
     capture.describe(&ring(), json!({}));
     let loaded = capture.load().unwrap();
     assert_eq!(loaded.masks, MaskKind::Alpha);
+    tells(&loaded.notes, NoteKind::Understood, &["masks are the alpha of 4 photos"]);
     assert_right(&loaded, 4);
 }
 
@@ -399,6 +409,34 @@ fn photos_are_found_under_other_spellings_and_may_be_missing() {
 }
 
 #[test]
+fn photos_of_other_sizes_than_their_cameras_and_crops_are_read() {
+    // Reduced or enlarged, some more than others, beside cameras of one size.
+    let capture = Capture::new();
+    for ((name, c), (w, h)) in ring().into_iter().zip([(48, 36), (192, 144), (96, 72), (144, 108)]) {
+        shot(&c.resized(w, h), |_, _| WHITE).save(capture.at(name)).unwrap();
+    }
+    let named: Vec<(&str, Camera)> = ring().into_iter().map(|(name, c)| (&name[7..], c)).collect();
+    capture.colmap("sparse/0", &named, "\n");
+    let loaded = capture.load().unwrap();
+    assert_eq!((loaded.views[0].camera.width, loaded.views[1].camera.width), (48, 192));
+    assert_right(&loaded, 4);
+    // Cropped, each with a principal point of its own.
+    let capture = Capture::new();
+    let mut frames = ring();
+    let parts = [(0, 10, 80, 60), (12, 0, 84, 72), (5, 4, 90, 64), (20, 8, 70, 60)];
+    for ((name, c), (x, y, w, h)) in frames.iter_mut().zip(parts) {
+        let whole = shot(c, |_, _| WHITE);
+        image::imageops::crop_imm(&whole, x, y, w, h).to_image().save(capture.at(name)).unwrap();
+        (c.width, c.height) = (w, h);
+        (c.cx, c.cy) = (c.cx - f64::from(x), c.cy - f64::from(y));
+    }
+    capture.describe(&frames, json!({}));
+    let loaded = capture.load().unwrap();
+    assert_eq!(loaded.views[3].camera.cx, 28.0);
+    assert_right(&loaded, 4);
+}
+
+#[test]
 fn photos_that_are_not_read_are_named_with_what_to_do() {
     for (file, kind) in [
         ("a.HEIC", "HEIC"),
@@ -417,6 +455,12 @@ fn photos_that_are_not_read_are_named_with_what_to_do() {
         capture.describe(&ring(), json!({}));
         says(cameras(capture.0.path(), None, None), &[file, kind, "convert it to JPEG or PNG"]);
         says(cameras(&capture.at("images"), None, None), &[file, kind, "convert it to JPEG or PNG"]);
+        // Of photos in even steps none may be missing.
+        let turntable = "20,50".parse().unwrap();
+        says(cameras(capture.0.path(), None, Some(&turntable)), &[file, kind, "convert it to JPEG or PNG"]);
+        // Beside a photo of its name it is the same one, as cameras store both.
+        std::fs::rename(capture.at(&format!("images/{file}")), capture.at(&format!("images/B{}", &file[1..]))).unwrap();
+        assert_eq!(cameras(capture.0.path(), None, Some(&turntable)).unwrap().photos.len(), 3);
     }
     // By content: messengers rename files.
     for (bytes, kind) in [
@@ -446,10 +490,12 @@ fn colors_of_wide_gamut_photos_are_converted() {
         moxcms::TransformOptions::default(),
     );
     let into = into.unwrap();
-    for (profile, converted) in [
-        (p3.encode().unwrap(), true),
-        (moxcms::ColorProfile::new_srgb().encode().unwrap(), false),
-        (b"no profile".to_vec(), false),
+    for (profile, converted, jpeg) in [
+        (p3.encode().unwrap(), true, false),
+        (p3.encode().unwrap(), true, true),
+        (moxcms::ColorProfile::new_srgb().encode().unwrap(), false, false),
+        (moxcms::ColorProfile::new_srgb().encode().unwrap(), false, true),
+        (b"no profile".to_vec(), false, false),
     ] {
         let capture = Capture::new();
         for (name, c) in ring() {
@@ -458,15 +504,25 @@ fn colors_of_wide_gamut_photos_are_converted() {
             if converted {
                 into.transform(&srgb, &mut own).unwrap();
             }
-            let mut encoder = image::codecs::png::PngEncoder::new(std::fs::File::create(capture.at(name)).unwrap());
-            encoder.set_icc_profile(profile.clone()).unwrap();
-            encoder.write_image(&own, W, H, image::ExtendedColorType::Rgba8).unwrap();
+            if jpeg {
+                let file = std::fs::File::create(capture.at(&name.replace("png", "jpg"))).unwrap();
+                let mut encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(file, 98);
+                encoder.set_icc_profile(profile.clone()).unwrap();
+                let rgb = image::DynamicImage::ImageRgba8(own).into_rgb8();
+                encoder.write_image(&rgb, W, H, image::ExtendedColorType::Rgb8).unwrap();
+            } else {
+                let file = std::fs::File::create(capture.at(name)).unwrap();
+                let mut encoder = image::codecs::png::PngEncoder::new(file);
+                encoder.set_icc_profile(profile.clone()).unwrap();
+                encoder.write_image(&own, W, H, image::ExtendedColorType::Rgba8).unwrap();
+            }
         }
         capture.describe(&ring(), json!({}));
         let loaded = capture.load().unwrap();
         assert_right(&loaded, 4);
         let p = loaded.views[0].image.get_pixel(W / 2, H / 2);
-        assert!(p.0.iter().zip([200, 30, 20]).all(|(a, b)| a.abs_diff(b) <= 3), "{p:?}");
+        let most = if jpeg { 6 } else { 3 };
+        assert!(p.0.iter().zip([200, 30, 20]).all(|(a, b)| a.abs_diff(b) <= most), "{p:?}");
         assert_eq!(loaded.notes.iter().any(|n| n.kind == NoteKind::Changed && n.contains("sRGB")), converted);
     }
 }
@@ -508,32 +564,76 @@ fn masks_are_looked_at_before_they_are_believed() {
         assert_right(&c.load().unwrap(), 4);
     }
     // The negative: refused by name, and right with the option that the message names.
-    let c = capture(&|i, c| {
-        let mut mask = outline(c);
-        image::imageops::invert(&mut mask);
-        (format!("masks/{}.png", stem(i)), mask)
-    });
-    says(c.load(), &["masks", "look inverted", "--invert-masks"]);
-    let given = LoadConfig { masks: MaskSource::Files(c.at("masks")), ..LoadConfig::default() };
-    says(load(&c.read(), &given), &["look inverted", "--invert-masks"]);
-    assert_right(&load(&c.read(), &LoadConfig { invert_masks: true, ..LoadConfig::default() }).unwrap(), 4);
-    // Names that fit no photo.
-    let c = capture(&|i, c| (format!("masks/other_{i}.png"), outline(c)));
-    let notes = match c.load() {
-        Ok(loaded) => loaded.notes,
-        // Busy backgrounds of no pose may be refused for themselves.
-        Err(e) => {
-            assert!(matches!(e, SceneError::NotCutOut { .. }), "{e}");
-            let mut notes = Vec::new();
-            for (i, (name, c0)) in ring().iter().enumerate() {
-                assert!(i < 4);
-                shot(c0, |_, _| WHITE).save(c.at(name)).unwrap();
-            }
-            notes.extend(c.load().unwrap().notes);
-            notes
+    for form in ["masks/{}.png", "mask/{}.mask.png"] {
+        let (folder, _) = form.split_once('/').unwrap();
+        let c = capture(&|i, c| {
+            let mut mask = outline(c);
+            image::imageops::invert(&mut mask);
+            (form.replace("{}", stem(i)), mask)
+        });
+        says(c.load(), &[&format!("the folder {folder}"), "look inverted", "--invert-masks"]);
+        let given = LoadConfig { masks: MaskSource::Files(c.at(folder)), ..LoadConfig::default() };
+        says(load(&c.read(), &given), &["look inverted", "--invert-masks"]);
+        assert_right(&load(&c.read(), &LoadConfig { invert_masks: true, ..LoadConfig::default() }).unwrap(), 4);
+    }
+}
+
+#[test]
+fn masks_whose_names_fit_no_photo_are_not_used_and_said() {
+    for form in ["masks/other_{}.png", "image_masks/{}.jpg.png", "masks/frame_0000{}.mask.png"] {
+        let capture = Capture::new();
+        for (i, (name, c)) in ring().iter().enumerate() {
+            shot(c, |_, _| WHITE).save(capture.at(name)).unwrap();
+            outline(c).save(capture.at(&form.replace("{}", &i.to_string()))).unwrap();
         }
-    };
-    tells(&notes, NoteKind::Warning, &["masks", "none of its 4 images has a photo's name"]);
+        capture.describe(&ring(), json!({}));
+        let loaded = capture.load().unwrap();
+        assert_eq!(loaded.masks, MaskKind::Plain);
+        let (folder, _) = form.split_once('/').unwrap();
+        tells(&loaded.notes, NoteKind::Warning, &[folder, "none of its 4 images has a photo's name"]);
+        assert_right(&loaded, 4);
+        // Where nothing else shows the object, the refusal says it, too.
+        for (i, (name, c)) in ring().iter().enumerate() {
+            shot(c, busy(i)).save(capture.at(name)).unwrap();
+        }
+        match capture.load() {
+            Ok(loaded) => tells(&loaded.notes, NoteKind::Warning, &[folder, "none of its 4 images"]),
+            Err(error) => {
+                assert!(matches!(error, SceneError::NotCutOut { .. }), "{error}");
+                assert!(error.to_string().contains(&format!("{folder}: none of its 4 images")), "{error}");
+            }
+        }
+    }
+}
+
+#[test]
+fn photos_without_a_camera_are_named() {
+    for format in [Format::Transforms, Format::Colmap, Format::Realitycapture] {
+        let capture = Capture::new();
+        for (name, c) in ring() {
+            shot(&c, |_, _| WHITE).save(capture.at(name)).unwrap();
+        }
+        // What goes with a photo is no other one.
+        for more in ["e.png", "a.png.png", "b.mask.png", "c_depth_0001.png"] {
+            shot(&camera(0, 4), |_, _| WHITE).save(capture.at(&format!("images/{more}"))).unwrap();
+        }
+        let named: Vec<(&str, Camera)> = ring().into_iter().map(|(name, c)| (&name[7..], c)).collect();
+        match format {
+            Format::Colmap => capture.colmap("sparse/0", &named, "\n"),
+            Format::Realitycapture => std::fs::write(capture.at("c.csv"), realitycapture(&named, [0.0; 2])).unwrap(),
+            _ => capture.describe(&ring(), json!({})),
+        }
+        let found = capture.read();
+        assert_eq!((found.format, found.photos.len()), (format, 4));
+        let left: Vec<&Note> = found.notes.iter().filter(|n| n.contains("no camera")).collect();
+        assert!(left.len() == 1 && left[0].kind == NoteKind::Dropped, "{:?}", found.notes);
+        assert!(left[0].ends_with("1 photos have no camera and are left out: e.png"), "{:?}", left[0]);
+        if format == Format::Transforms {
+            // A description that is named itself may be one of several.
+            let found = cameras(&capture.at("transforms.json"), None, None).unwrap();
+            assert!(found.notes.iter().all(|n| !n.contains("no camera")), "{:?}", found.notes);
+        }
+    }
 }
 
 #[test]
@@ -623,6 +723,21 @@ fn up_of_nerfstudios_colmap_scenes_is_not_z() {
     assert!(up(json!({"applied_transform": applied, "orientation_override": "up"})));
     assert!(!up(json!({"applied_transform": applied, "orientation_override": "none"})));
     assert!(!up(json!({})));
+    // And it is found, however COLMAP's world lies: here by the cameras, as nothing else shows it.
+    for turn in [DMat3::from_rotation_x(0.7), DMat3::from_rotation_y(-2.0) * DMat3::from_rotation_x(1.1)] {
+        let capture = Capture::new();
+        let mut frames = ring();
+        for (name, c) in &mut frames {
+            shot(c, |_, _| [0; 4]).save(capture.at(name)).unwrap();
+            c.world_to_camera *= DMat4::from_mat3(turn.transpose());
+        }
+        capture.describe(&frames, json!({"applied_transform": applied}));
+        let scene = Scene::load(capture.read(), &SceneConfig::default()).unwrap();
+        tells(&scene.notes, NoteKind::Assumed, &["up is taken from", "--up"]);
+        let frame = canonical_from_user(&scene.loaded.views, &scene.frame).unwrap();
+        let up = frame.canonical_from_user.rotation.inverse() * DVec3::Z;
+        assert!(up.angle_between(turn * DVec3::Z) < 0.02, "{up}");
+    }
 }
 
 /// A camera as Metashape's XML has it.
@@ -721,14 +836,17 @@ fn metashape_rigs_and_components_are_put_together() {
 }
 
 #[test]
-fn polycams_files_without_sizes_are_read() {
-    // Sizes from the images; x, y, z are Polycam's z, x, y.
-    for folder in ["", "corrected_"] {
+fn polycams_files_with_and_without_sizes_are_read() {
+    // Sizes from the images, where the files have none; x, y, z are Polycam's z, x, y.
+    for (folder, sized) in [("", false), ("corrected_", false), ("", true), ("corrected_", true)] {
         let capture = Capture::new();
         for (i, c) in (0..4).map(|i| (i, camera(i, 4))) {
             let axes = DMat3::from_mat4(c.world_to_camera).transpose();
             let columns = [axes.x_axis, -axes.y_axis, -axes.z_axis, c.center()];
             let mut root = json!({"fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy});
+            if sized {
+                (root["width"], root["height"]) = (json!(W), json!(H));
+            }
             for (ours, theirs) in [(0, 2), (1, 0), (2, 1)] {
                 for (j, column) in columns.iter().enumerate() {
                     root[format!("t_{theirs}{j}")] = json!(column[ours]);
@@ -767,6 +885,90 @@ fn colmap_models_are_written_with_their_origin() {
         assert_eq!(bytes.len(), 8 + 2 * (8 + 24 + 3 + 8 + 8));
         assert_eq!(bytes[16..24], (origin.x + 0.1).to_le_bytes());
         assert_eq!(bytes[40..43], [1, 2, 3]);
+    }
+}
+
+/// What is left of a file.
+struct Rest<'a>(&'a [u8]);
+
+impl Rest<'_> {
+    fn bytes<const N: usize>(&mut self) -> [u8; N] {
+        let (head, tail) = self.0.split_first_chunk::<N>().expect("more bytes");
+        self.0 = tail;
+        *head
+    }
+
+    fn i32(&mut self) -> i32 {
+        i32::from_le_bytes(self.bytes())
+    }
+
+    fn u64(&mut self) -> u64 {
+        u64::from_le_bytes(self.bytes())
+    }
+
+    fn f64s<const N: usize>(&mut self) -> [f64; N] {
+        std::array::from_fn(|_| f64::from_le_bytes(self.bytes()))
+    }
+
+    fn text(&mut self) -> String {
+        let end = self.0.iter().position(|b| *b == 0).expect("an end of the name");
+        let text = std::str::from_utf8(&self.0[..end]).unwrap().to_owned();
+        self.0 = &self.0[end + 1..];
+        text
+    }
+}
+
+/// As `colmap_parsing_utils.py` and the parser of COLMAP's scenes of nerfstudio 1.1.5 read them: numbers of models, sizes of entries, an image
+/// of its camera's size for each name under images/, one camera model for all, points in a file of their own.
+#[test]
+fn written_models_follow_the_rules_of_nerfstudios_reader() {
+    for origin in [DVec3::ZERO, DVec3::new(448_000.0, 5_411_000.0, 300.0)] {
+        let capture = Capture::new();
+        let view = |(i, (name, camera)): (usize, (&str, Camera))| View {
+            name: format!("{} photo {i}", &name[7..8]),
+            camera,
+            image: shot(&camera, |_, _| [0; 4]),
+        };
+        let views: Vec<View> = ring().into_iter().enumerate().map(view).collect();
+        let points = [(DVec3::new(0.1, 0.2, 0.3), [1, 2, 3]), (DVec3::ZERO, [255, 0, 9])];
+        freerange_scene::write_colmap(capture.0.path(), &views, origin, &points).unwrap();
+        let file = |name: &str| std::fs::read(capture.at(&format!("sparse/0/{name}.bin"))).unwrap();
+        let (cameras, images, cloud) = (file("cameras"), file("images"), file("points3D"));
+        let mut rest = Rest(&cameras);
+        let mut lenses = HashMap::new();
+        for _ in 0..rest.u64() {
+            // Model 1 is PINHOLE, with four parameters.
+            let (id, model, size) = (rest.i32(), rest.i32(), (rest.u64(), rest.u64()));
+            assert_eq!(model, 1);
+            lenses.insert(id, (size, rest.f64s::<4>()));
+        }
+        assert!(rest.0.is_empty() && lenses.len() == 4);
+        let mut rest = Rest(&images);
+        assert_eq!(rest.u64(), 4);
+        for view in &views {
+            let (_, [w, x, y, z], t, camera) = (rest.i32(), rest.f64s::<4>(), rest.f64s::<3>(), rest.i32());
+            let (name, keypoints) = (rest.text(), rest.u64());
+            assert_eq!((name.as_str(), keypoints), (format!("{}.png", view.name).as_str(), 0));
+            let rotation = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w));
+            let center = -(rotation.transpose() * DVec3::from_array(t));
+            assert!(center.distance(view.camera.center() + origin) < 1e-8, "{center}");
+            assert!((rotation.row(2) - view.camera.world_to_camera.row(2).truncate()).length() < 1e-12);
+            let ((width, height), [fx, fy, cx, cy]) = lenses[&camera];
+            let c = &view.camera;
+            assert_eq!((fx, fy, cx, cy), (c.fx, c.fy, c.cx, c.cy));
+            let (w, h) = image::image_dimensions(capture.at("images").join(&name)).unwrap();
+            assert_eq!((u64::from(w), u64::from(h)), (width, height));
+        }
+        assert!(rest.0.is_empty());
+        let mut rest = Rest(&cloud);
+        assert_eq!(rest.u64(), 2);
+        for (id, (place, color)) in (1u64..).zip(&points) {
+            assert_eq!(rest.u64(), id);
+            assert!(DVec3::from_array(rest.f64s()).distance(*place + origin) < 1e-8);
+            let (found, error, track) = (rest.bytes::<3>(), rest.f64s::<1>(), rest.u64());
+            assert_eq!((found, error, track), (*color, [0.0], 0));
+        }
+        assert!(rest.0.is_empty());
     }
 }
 

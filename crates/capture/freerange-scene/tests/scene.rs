@@ -163,6 +163,22 @@ fn cameras_need_no_images_where_the_size_is_given() {
 }
 
 #[test]
+fn cameras_are_read_whatever_masks_their_file_names() {
+    // Of one frame, and of all; whether the file is there or not.
+    for (frame, all) in
+        [(Some("masks/000.png"), None), (None, Some("gone\\mask.png")), (Some("./m.png"), Some("n.png"))]
+    {
+        let files = Files::new();
+        let mut d = description();
+        (d["w"], d["h"]) = (json!(SIDE), json!(SIDE));
+        (d["frames"][0]["mask_path"], d["mask_path"]) = (json!(frame), json!(all));
+        std::fs::write(files.path("transforms.json"), d.to_string()).unwrap();
+        let cameras = load_cameras(files.0.path()).unwrap();
+        assert_eq!((cameras.len(), cameras[3].0.as_str(), cameras[3].1.width), (4, "003", SIDE));
+    }
+}
+
+#[test]
 fn a_plain_background_becomes_transparent() {
     let files = Files::new();
     for i in 0..4 {
@@ -304,6 +320,7 @@ fn descriptions_that_make_no_sense_are_refused() {
         (|d| d["train_filenames"] = json!(["./images/000"]), &["at least 2 input views", "found 1"]),
         (|d| d["train_filenames"] = json!(["x.png"]), &["`train_filenames`", "none of them"]),
         (|d| d["train_filenames"] = json!(1), &["`train_filenames`", "found 1"]),
+        (|d| d["val_filenames"] = json!("x"), &["`val_filenames`", "found \"x\""]),
     ];
     for (i, (change, words)) in cases.into_iter().enumerate() {
         let mut d = description();
@@ -324,6 +341,16 @@ fn descriptions_of_other_systems_are_read() {
     d["train_filenames"] = json!(["images/000", ".\\images\\001.PNG", "./images/002.jpg"]);
     let scene = files.load(&d).unwrap();
     assert_eq!((scene.inputs.len(), scene.further.len()), (3, 1));
+    // Lists of all but the inputs, by either name.
+    d.as_object_mut().unwrap().remove("train_filenames");
+    for list in ["val_filenames", "test_filenames"] {
+        let mut d = d.clone();
+        d[list] = json!(["images/001.PNG", "./images/003"]);
+        let scene = files.load(&d).unwrap();
+        let names: Vec<&str> = scene.further.iter().map(|v| v.name.as_str()).collect();
+        assert_eq!((scene.inputs.len(), names), (2, vec!["001", "003"]));
+        assert!(scene.notes.iter().any(|n| n.contains("only compared with")), "{:?}", scene.notes);
+    }
     // A list that has more than the file; a mark of the byte order before it all.
     d["train_filenames"] = json!(["images/000", "images/001.PNG", "gone.png"]);
     assert!(files.load(&d).unwrap().notes.iter().any(|n| n.contains("gone.png")));

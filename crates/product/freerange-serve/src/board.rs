@@ -15,15 +15,15 @@ use std::{
     path::{Path, PathBuf},
     sync::{
         Arc, Condvar, Mutex, MutexGuard, PoisonError,
-        atomic::{AtomicBool, Ordering::Relaxed},
+        atomic::{AtomicBool, AtomicU64, Ordering::Relaxed},
     },
     time::Instant,
 };
 
 use freerange_util::IoError;
 
-pub use self::arriving::Submission;
 use self::table::{Job, Table};
+pub use self::{arriving::Submission, results::Held};
 use crate::{
     Engine, Limits, Refusal, ServeError,
     disk::size_of,
@@ -46,6 +46,8 @@ pub struct Board {
     doomed: Mutex<Vec<PathBuf>>,
     doom_changed: Condvar,
     stopping: AtomicBool,
+    /// Bytes of memory that results take which are on their way to clients.
+    held: AtomicU64,
     pub metrics: Metrics,
 }
 
@@ -86,6 +88,7 @@ impl Board {
             doomed: Mutex::default(),
             doom_changed: Condvar::new(),
             stopping: AtomicBool::new(false),
+            held: AtomicU64::new(0),
             metrics: Metrics::new(),
         };
         board.recover().map_err(IoError::at(&board.root))?;
@@ -231,4 +234,88 @@ fn no_such() -> Refusal {
 /// Whether a text can be a job's.
 pub fn is_id(text: &str) -> bool {
     text.len() == 16 && text.bytes().all(|b| b.is_ascii_digit() || (b'a'..=b'f').contains(&b))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::{ops::ControlFlow, sync::mpsc, thread, time::Duration};
+
+    use freerange_gaussians::Gaussians;
+    use freerange_scene::{
+        camera::{Camera, View},
+        estimate::LeaveOneOut,
+    };
+    use image::RgbaImage;
+
+    use super::*;
+    use crate::{EngineError, FoundCameras, JobOptions, Outcome, Scene, Search, SearchStep, Step, scene::SceneOptions};
+
+    /// Computes nothing.
+    struct Idle;
+
+    impl Engine for Idle {
+        fn name(&self) -> String {
+            String::new()
+        }
+
+        fn choose(&self, _: &[View]) -> Result<Vec<usize>, String> {
+            Ok(Vec::new())
+        }
+
+        fn leave_one_out(&self) -> Option<LeaveOneOut> {
+            None
+        }
+
+        fn run(
+            &self,
+            _: &Scene,
+            _: &JobOptions,
+            _: &mut dyn FnMut(&Step<'_>) -> ControlFlow<()>,
+        ) -> Result<Outcome, EngineError> {
+            Err(EngineError::Cancelled)
+        }
+
+        fn picture(&self, _: &Gaussians, _: &Camera) -> Result<RgbaImage, String> {
+            Err(String::new())
+        }
+
+        fn camera_finder(&self) -> Result<String, String> {
+            Err(String::new())
+        }
+
+        fn find_cameras(&self, _: &Search<'_>, _: &mut dyn FnMut(SearchStep)) -> Result<FoundCameras, EngineError> {
+            Err(EngineError::Cancelled)
+        }
+    }
+
+    /// V9.
+    #[test]
+    fn nobody_waits_while_a_record_is_written() {
+        let folder = tempfile::tempdir().unwrap();
+        let board = Board::open(Some(folder.path()), Limits::default(), Arc::new(Idle)).unwrap();
+        let (title, passed_over) = ("before".to_owned(), Vec::new());
+        let submission =
+            Submission { title, scene: SceneOptions::default(), go: None, splats: None, passed_over, bytes: 0 };
+        let id = board.arrive(0).unwrap().submit(submission).unwrap();
+        let writing = board.writing(&id).unwrap();
+        let disk = crate::record::DISK.lock().unwrap_or_else(PoisonError::into_inner);
+        let (told, hears) = mpsc::channel();
+        thread::scope(|s| {
+            let writes = s.spawn(|| board.rename(&id, "after"));
+            s.spawn(|| {
+                // Until the other thread waits for the disk.
+                while writing.try_lock().is_ok() {
+                    thread::sleep(Duration::from_millis(1));
+                }
+                let seen = board.get(&id).map(|job| job["title"].clone());
+                told.send(seen.and_then(|title| board.arrive(0).map(|_| title))).ok();
+            });
+            let seen = hears.recv_timeout(Duration::from_secs(20)).expect("others wait for the disk");
+            assert_eq!(seen.unwrap(), "before");
+            assert!(!writes.is_finished());
+            drop(disk);
+            writes.join().unwrap().unwrap();
+        });
+        assert_eq!(board.get(&id).unwrap()["title"], "after");
+    }
 }

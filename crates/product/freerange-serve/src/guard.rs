@@ -58,7 +58,7 @@ impl Guard {
     pub fn check_place(&self, request: &Request) -> Result<(), Refusal> {
         let host = request.header("host").ok_or_else(|| Refusal::new(400, "the request has no Host"))?;
         if !self.knows(host) {
-            return Err(Refusal::new(421, "this Host is not served here (--name allows one)"));
+            return Err(Refusal::new(421, "this Host is not served here: ask whoever started the server"));
         }
         if let Some(origin) = request.header("origin") {
             let authority = origin.strip_prefix("http://").or_else(|| origin.strip_prefix("https://"));

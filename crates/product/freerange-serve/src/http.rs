@@ -254,11 +254,13 @@ pub struct Response {
     pub kind: &'static str,
     pub content: Content,
     pub headers: Vec<(&'static str, String)>,
+    /// What is let go once it is sent.
+    held: Option<Box<dyn Send>>,
 }
 
 impl Response {
     pub fn new(kind: &'static str, content: Content) -> Self {
-        Self { status: 200, kind, content, headers: Vec::new() }
+        Self { status: 200, kind, content, headers: Vec::new(), held: None }
     }
 
     pub fn json(value: &impl serde::Serialize) -> Self {
@@ -280,11 +282,20 @@ impl Response {
         self
     }
 
+    /// Holds something until it is sent, or the client has gone.
+    pub fn holding(mut self, held: impl Send + 'static) -> Self {
+        self.held = Some(Box::new(held));
+        self
+    }
+
     /// Sends it, without the content where only the head was asked for, and ends the connection; within `most`, whatever the client does.
-    pub fn send(self, stream: TcpStream, head_only: bool, most: Duration) {
+    pub fn send(mut self, stream: TcpStream, head_only: bool, most: Duration) {
+        let held = self.held.take();
         let mut until = Until { stream, deadline: Instant::now() + most };
+        let sent = self.write(&mut until, head_only);
+        drop(held);
         // A client that has gone is told nothing.
-        if self.write(&mut until, head_only).is_ok() {
+        if sent.is_ok() {
             linger(&until.stream);
         }
     }
@@ -377,6 +388,7 @@ mod tests {
 
     use super::*;
 
+    /// V6.
     #[test]
     fn a_client_that_reads_slowly_is_let_go() {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();

@@ -9,7 +9,7 @@ const STYLE: (&str, &str, &str) = ("/style.css", "text/css; charset=utf-8", incl
 
 /// Its files: address, kind, content. The drawing is that of the page that Gaussians are exported to; the other scripts are modules of one
 /// thing each.
-pub const FILES: [(&str, &str, &str); 16] = [
+pub const FILES: [(&str, &str, &str); 17] = [
     ("/", "text/html; charset=utf-8", include_str!("page/index.html")),
     STYLE,
     ("/viewer.js", SCRIPT, viewer::SCRIPT),
@@ -23,6 +23,7 @@ pub const FILES: [(&str, &str, &str); 16] = [
     ("/edit.js", SCRIPT, include_str!("page/edit.js")),
     ("/send.js", SCRIPT, include_str!("page/send.js")),
     ("/record.js", SCRIPT, include_str!("page/record.js")),
+    ("/remove.js", SCRIPT, include_str!("page/remove.js")),
     ("/gif.js", SCRIPT, include_str!("page/gif.js")),
     ("/dom.js", SCRIPT, include_str!("page/dom.js")),
     ("/state.js", SCRIPT, include_str!("page/state.js")),

@@ -104,6 +104,10 @@ pub struct Record {
     pub seconds: Vec<(String, f64)>,
 }
 
+/// Held by tests in which the disk takes its time.
+#[cfg(test)]
+pub static DISK: std::sync::Mutex<()> = std::sync::Mutex::new(());
+
 /// Most bytes of a record.
 const LARGEST: u64 = 64 << 20;
 
@@ -122,6 +126,8 @@ pub fn thumbnail_file(folder: &Path) -> PathBuf {
 
 impl Record {
     pub fn write(&self, folder: &Path) -> std::io::Result<()> {
+        #[cfg(test)]
+        let _disk = DISK.lock();
         let text = serde_json::to_vec(self).map_err(std::io::Error::other)?;
         write_atomically(&file(folder), |w| w.write_all(&text))
     }

@@ -13,7 +13,7 @@ use serde_json::json;
 
 use crate::{
     Example, JobOptions, Refusal,
-    board::{Board, Submission, is_id},
+    board::{Board, Held, Submission, is_id},
     guard::{Guard, cookie},
     http::{Content, Request, Response, Until},
     multipart::{Multipart, boundary},
@@ -306,32 +306,37 @@ fn post(site: &Site, request: &mut Request) -> Answer {
 }
 
 /// What is below the samples of a job.
-fn samples(board: &Board, request: &mut Request, id: &str, rest: &[&str]) -> Answer {
+fn samples(board: &Arc<Board>, request: &mut Request, id: &str, rest: &[&str]) -> Answer {
     match (request.method.as_str(), rest) {
         ("GET", [name]) => sample(board, id, name),
         ("GET", [i, what @ ("whole" | "kept")]) => {
             let i = number(i, 64)?;
+            let held = Held::take(board, id, i)?;
             let bytes = if *what == "kept" { board.kept(id, i)? } else { board.whole_rows(id, i)? };
-            Ok(Response::new("application/octet-stream", Content::Bytes(bytes)))
+            Ok(Response::new("application/octet-stream", Content::Bytes(bytes)).holding(held))
         }
         ("PUT", [i, "kept"]) => {
-            let kept = request.body(KEPT)?;
-            Ok(Response::json(&json!({ "gaussians": board.keep(id, number(i, 64)?, &kept)? })))
+            let (i, kept) = (number(i, 64)?, request.body(KEPT)?);
+            let _held = Held::take(board, id, i)?;
+            Ok(Response::json(&json!({ "gaussians": board.keep(id, i, &kept)? })))
         }
         _ => Err(missing()),
     }
 }
 
-fn sample(board: &Board, id: &str, name: &str) -> Answer {
+fn sample(board: &Arc<Board>, id: &str, name: &str) -> Answer {
     let (i, format) = name.split_once('.').map_or((name, None), |(i, f)| (i, Some(f)));
     let i = number(i, 64)?;
     let Some(format) = format else {
-        return Ok(Response::new("application/octet-stream", Content::Bytes(board.rows(id, i)?)));
+        let held = Held::take(board, id, i)?;
+        return Ok(Response::new("application/octet-stream", Content::Bytes(board.rows(id, i)?)).holding(held));
     };
     let format = Format::ALL.into_iter().find(|f| f.extension() == format).ok_or_else(missing)?;
+    let held = Held::take(board, id, i)?;
     let (bytes, name) = board.result(id, i, format)?;
     let disposition = format!("attachment; filename=\"{name}\"");
-    Ok(Response::new("application/octet-stream", Content::Bytes(bytes)).header("Content-Disposition", disposition))
+    let file = Response::new("application/octet-stream", Content::Bytes(bytes));
+    Ok(file.header("Content-Disposition", disposition).holding(held))
 }
 
 fn picture(path: &Path) -> Answer {

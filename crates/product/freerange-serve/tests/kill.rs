@@ -3,7 +3,8 @@
 //!
 //!     SOAK_JOBS=400 cargo test -p freerange-serve --release --test kill -- --ignored --nocapture many
 //!
-//! The disk is a tmpfs, which only root may mount. Without it, or with fewer than 200 jobs, that part is left out, with a message.
+//! The disk is a tmpfs, which only root may mount. Without it, or with fewer than 200 jobs, that part is left out, with a message. With `SOAK_PLOT`
+//! a plot of the memory is written there, an SVG file.
 
 mod common;
 
@@ -132,6 +133,69 @@ impl Drop for Disk {
     }
 }
 
+/// What the server's memory was, and what was done to it; times are in seconds.
+#[derive(Default)]
+struct Watched {
+    /// Times and megabytes.
+    memory: Vec<(f64, u64)>,
+    kills: Vec<f64>,
+    full: Option<[f64; 2]>,
+}
+
+impl Watched {
+    /// What is looked at after the last kill: the memory of one process.
+    fn last(&self) -> Vec<u64> {
+        let from = self.kills.last().copied().unwrap_or(0.0);
+        self.memory.iter().filter(|(t, _)| *t > from).map(|(_, mb)| *mb).collect()
+    }
+
+    /// The memory as a picture.
+    fn svg(&self) -> String {
+        let end = self.memory.last().map_or(1.0, |(t, _)| t.max(1.0));
+        let most = self.memory.iter().map(|(_, mb)| *mb).max().unwrap_or(0).div_ceil(50).max(1) * 50;
+        let x = |t: f64| 50.0 + 650.0 * t / end;
+        let y = |mb: f64| 200.0 - 180.0 * mb / most as f64;
+        let text = |x: f64, y: f64, anchor: &str, text: String| {
+            format!("<text x=\"{x:.1}\" y=\"{y:.1}\" text-anchor=\"{anchor}\">{text}</text>\n")
+        };
+        let mut svg = "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 720 240\" font-family=\"sans-serif\" font-size=\"12\">\n\
+             <rect width=\"720\" height=\"240\" fill=\"#fff\"/>\n"
+            .to_owned();
+        if let Some([from, to]) = self.full {
+            let width = x(to) - x(from);
+            svg +=
+                &format!("<rect x=\"{:.1}\" y=\"20\" width=\"{width:.1}\" height=\"180\" fill=\"#eee\"/>\n", x(from));
+            svg += &text(x(from) + width / 2.0, 14.0, "middle", "disk full".into());
+        }
+        for kill in &self.kills {
+            let at = x(*kill);
+            svg += &format!("<path d=\"M{at:.1} 20V200\" stroke=\"#777\" stroke-dasharray=\"4\"/>\n");
+            svg += &text(at, 14.0, "middle", "kill -9".into());
+        }
+        for mb in [0, most / 2, most] {
+            svg += &format!("<path d=\"M50 {:.1}H700\" stroke=\"#ccc\"/>\n", y(mb as f64));
+            svg += &text(45.0, y(mb as f64) + 4.0, "end", format!("{mb} MB"));
+        }
+        for part in 0..=4 {
+            let t = end * f64::from(part) / 4.0;
+            svg += &text(x(t), 216.0, "middle", format!("{t:.0} s"));
+        }
+        let points: String = self.memory.iter().map(|(t, mb)| format!("{:.1},{:.1} ", x(*t), y(*mb as f64))).collect();
+        svg += &format!(
+            "<polyline points=\"{}\" fill=\"none\" stroke=\"#1f5fae\" stroke-width=\"1.5\"/>\n",
+            points.trim()
+        );
+        svg += &text(375.0, 234.0, "middle", "resident memory of the server".into());
+        svg + "</svg>\n"
+    }
+}
+
+/// The middle of some numbers.
+fn median(mut values: Vec<u64>) -> u64 {
+    values.sort_unstable();
+    values.get(values.len() / 2).copied().unwrap_or(0)
+}
+
 #[test]
 #[ignore = "minutes"]
 fn many_jobs_survive_two_kills() {
@@ -149,27 +213,23 @@ fn many_jobs_survive_two_kills() {
     let child = Mutex::new(child);
     let (next, ended) = (AtomicUsize::new(0), AtomicUsize::new(0));
     let done: Mutex<BTreeSet<String>> = Mutex::default();
-    let memory: Mutex<Vec<(u64, u64)>> = Mutex::default();
-    // What each hostile input was answered, and how often.
-    let answers: Mutex<BTreeMap<(&str, u16), usize>> = Mutex::default();
+    // What came of each hostile input, and how often: a status, or how its job ended.
+    let answers: Mutex<BTreeMap<(&str, String), usize>> = Mutex::default();
     // Answers that the disk is full, and jobs that failed for it.
     let (refused, failed) = (AtomicUsize::new(0), AtomicUsize::new(0));
     let kind = format!("multipart/form-data; boundary={BOUNDARY}");
-    let begin = Instant::now();
+    let (begin, mut watched) = (Instant::now(), Watched::default());
     let client = || {
         loop {
             let n = next.fetch_add(1, SeqCst);
             if n >= jobs {
                 return;
             }
-            let mut cut = folder("x/");
-            cut[3].bytes.truncate(10_000);
-            let parts = match n % 3 {
-                0 | 1 => vec![Part::field("example", "bowl"), Part::field("go", "{}")],
-                _ => [cut, vec![Part::file("a.png", bomb(60_000, 60_000))], vec![Part::file("../a.png", "x")]]
-                    [n / 3 % 3]
-                    .clone(),
+            let (what, parts) = match n % 3 {
+                0 | 1 => ("", vec![Part::field("example", "bowl"), Part::field("go", "{}")]),
+                _ => hostile(n / 3),
             };
+            let count = |came: &str| *answers.lock().unwrap().entry((what, came.to_owned())).or_default() += 1;
             let id = loop {
                 match ask(address, "POST", "/jobs", &kind, &form(&parts)) {
                     Some((201, job)) => break job["id"].as_str().map(str::to_owned),
@@ -181,8 +241,7 @@ fn many_jobs_survive_two_kills() {
                     }
                     Some((status, _)) => {
                         assert!(n % 3 == 2 && (400..500).contains(&status), "{status}");
-                        let which = ["a cut photo", "a large image", "a path outside"][n / 3 % 3];
-                        *answers.lock().unwrap().entry((which, status)).or_default() += 1;
+                        count(&status.to_string());
                         break None;
                     }
                 }
@@ -199,6 +258,9 @@ fn many_jobs_survive_two_kills() {
                         _ => thread::sleep(Duration::from_millis(20)),
                     }
                 };
+                if n % 3 == 2 {
+                    count(job["state"].as_str().unwrap());
+                }
                 if job["state"] == "failed" && job["error"] == FULL {
                     failed.fetch_add(1, SeqCst);
                 } else {
@@ -213,27 +275,30 @@ fn many_jobs_survive_two_kills() {
     };
     thread::scope(|s| {
         (0..40).for_each(|_| drop(s.spawn(client)));
-        let (mut kills, mut before) = (0, None);
+        let mut before = None;
         while ended.load(SeqCst) < jobs {
             if let (Some(disk), None) = (&disk, before)
                 && ended.load(SeqCst) >= jobs / 2
             {
+                let from = begin.elapsed().as_secs_f64();
                 disk.fill(Duration::from_secs(3));
+                watched.full = Some([from, begin.elapsed().as_secs_f64()]);
                 before = Some(done.lock().unwrap().len());
             }
+            let kills = watched.kills.len();
             if kills < 2 && ended.load(SeqCst) >= (kills + 1) * jobs / 3 {
                 let mut child = child.lock().unwrap();
                 child.kill().unwrap();
                 child.wait().unwrap();
+                watched.kills.push(begin.elapsed().as_secs_f64());
                 *child = start(keep.path(), address.port()).0;
-                kills += 1;
             }
             if let Some(mb) = resident(child.lock().unwrap().id()) {
-                memory.lock().unwrap().push((begin.elapsed().as_secs(), mb));
+                watched.memory.push((begin.elapsed().as_secs_f64(), mb));
             }
             thread::sleep(Duration::from_millis(500));
         }
-        assert_eq!(kills, 2);
+        assert_eq!(watched.kills.len(), 2);
         if let Some(before) = before {
             let (refused, failed, after) = (refused.load(SeqCst), failed.load(SeqCst), done.lock().unwrap().len());
             println!(
@@ -254,19 +319,27 @@ fn many_jobs_survive_two_kills() {
     let idle = |j: &serde_json::Value| !busy.contains(&j["state"].as_str().unwrap_or_default());
     assert!(all.iter().all(idle), "somebody still waits");
     assert!(files(keep.path()).iter().all(|f| !f.contains("upload")), "no upload is left");
-    let memory = memory.into_inner().unwrap();
     let states = all.iter().fold(BTreeMap::<_, usize>::new(), |mut counts, j| {
         *counts.entry(j["state"].as_str().unwrap_or_default()).or_default() += 1;
         counts
     });
-    println!("{} jobs, {} done, {:?}\nseconds and MB: {memory:?}", jobs, done.len(), begin.elapsed());
-    println!("{states:?}\nhostile: {:?}", answers.into_inner().unwrap());
+    println!("{jobs} jobs, {} done, {:?}, {states:?}", done.len(), begin.elapsed());
+    for ((what, came), count) in answers.into_inner().unwrap() {
+        println!("{what}: {count} x {came}");
+    }
     // All clients have gone: what is open is the server's own.
     let open = descriptors(child.lock().unwrap().id());
     println!("{open:?} descriptors");
     assert!(open.is_none_or(|n| n < 40), "{open:?} descriptors");
-    let most = memory.iter().map(|m| m.1).max().unwrap_or(0);
+    let most = watched.memory.iter().map(|m| m.1).max().unwrap_or(0);
+    let last = watched.last();
+    let [early, late] = [0..last.len() / 2, last.len() / 2..last.len()].map(|half| median(last[half].to_vec()));
+    println!("memory: at most {most} MB; after the last kill {early} MB, later {late} MB");
+    if let Ok(path) = env::var("SOAK_PLOT") {
+        fs::write(path, watched.svg()).unwrap();
+    }
     assert!(most < 400, "{most} MB");
+    assert!(late < early + 32, "memory grows: {early} MB, later {late} MB");
     let mut child = child.into_inner().unwrap();
     child.kill().unwrap();
     child.wait().unwrap();

@@ -12,6 +12,10 @@ use std::{
 };
 
 use common::*;
+use freerange_gaussians::{
+    Splats,
+    formats::{Format, WriteOptions, encode},
+};
 use freerange_serve::{Limits, ServeConfig};
 
 fn with(limits: Limits) -> Running {
@@ -67,6 +71,34 @@ fn photos_take_no_more_memory_than_they_may() {
     let id = posted(&server, &slow_scene(1));
     let error = server.until(&id, &["failed", "ready"])["error"].as_str().unwrap_or_default().to_owned();
     assert!(error.contains("at most 21 MB"), "{error}");
+}
+
+/// V1.
+#[test]
+fn large_results_on_their_way_take_no_more_memory_than_they_may() {
+    let server = with(Limits { memory: 128 << 20, ..Limits::default() });
+    let mut cloud = Fake::cloud(1, 1);
+    let row = *cloud.row(0);
+    (0..300_000).for_each(|_| cloud.push(&row));
+    let ply = encode(&Splats::from(cloud), Format::Ply, &WriteOptions::default()).unwrap().bytes;
+    let id = posted(&server, &[Part::file("large.ply", ply)]);
+    let job = server.until(&id, &["done", "failed"]);
+    assert_eq!(job["state"], "done", "{job}");
+    let path = format!("/jobs/{id}/samples/0");
+    // Somebody asks for it, and reads no more than its first byte.
+    let mut slow = TcpStream::connect(server.address).unwrap();
+    slow.write_all(format!("GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n").as_bytes()).unwrap();
+    slow.read_exact(&mut [0]).unwrap();
+    for more in ["", "/whole", ".glb"] {
+        let refused = server.get(&format!("{path}{more}"));
+        assert!(refused.status == 503 && refused.error().contains("try again"), "{more}: {}", refused.status);
+    }
+    drop(slow);
+    let begin = Instant::now();
+    while server.get(&path).status != 200 {
+        assert!(begin.elapsed() < Duration::from_secs(30), "its memory is never free again");
+        thread::sleep(Duration::from_millis(20));
+    }
 }
 
 /// V2.

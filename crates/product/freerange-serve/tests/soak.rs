@@ -21,24 +21,6 @@ fn resources() -> (usize, u64) {
     (files, line.trim().trim_end_matches(" kB").parse::<u64>().unwrap() << 10)
 }
 
-/// Hostile uploads, by name.
-fn hostile(i: usize) -> (&'static str, Vec<Part>) {
-    let mut cut = folder("x/");
-    cut[3].bytes.truncate(10_000);
-    let mut nested = folder("x/");
-    nested[0].bytes = "[".repeat(50_000).into();
-    let kinds = [
-        ("bomb", vec![Part::file("a.png", bomb(60_000, 60_000))]),
-        ("path", vec![Part::file("../../../a.png", EXAMPLE.files[1].1)]),
-        ("archive", vec![Part::file("a.zip", "PK")]),
-        ("no picture", vec![Part::file("a.png", "no picture")]),
-        ("cut picture", cut),
-        ("nested JSON", nested),
-        ("too large", vec![Part::file("a.bin", vec![0; 3 << 20])]),
-    ];
-    kinds[i % kinds.len()].clone()
-}
-
 #[test]
 fn two_hundred_jobs_by_twenty_clients() {
     let keep = tempfile::tempdir().unwrap();

@@ -48,7 +48,7 @@ pub fn render_splats(splats: &Splats, camera: &Camera, mode: RenderMode) -> Resu
         return render_view(&cloud, &camera);
     }
     let rows = mip_compensated(cloud.rows(), &camera, MIP_BLUR);
-    let config = RasterConfig { blur: MIP_BLUR, ..RasterConfig::default() };
+    let config = RasterConfig { blur: MIP_BLUR, ..in_units_of(&cloud, &camera) };
     Ok(render(&rows, &[camera], &[WHITE], &config).lift()?.rgb)
 }
 
@@ -142,5 +142,24 @@ mod tests {
         let moved = Splats { origin: far, ..splats.clone() };
         let there = Camera { world_to_camera: camera.world_to_camera * DMat4::from_translation(-far), ..camera };
         assert!(apart(&shown, &render_splats(&moved, &there, RenderMode::Default).unwrap()) < 1e-3);
+    }
+
+    #[test]
+    fn small_and_large_units_are_drawn_alike() {
+        let eye = DVec3::new(2.0, -1.0, 0.7);
+        let splats = Splats { harmonics: Harmonics::default(), ..example(2) };
+        for mode in [RenderMode::Default, RenderMode::Mip] {
+            let usual = render_splats(&splats, &camera(eye), mode).unwrap();
+            assert!(apart(&usual, &vec![1.0; usual.len()]) > 0.1, "{mode:?} shows something");
+            for scale in [1e-3, 1e-2, 1e3] {
+                let mut scaled = splats.clone();
+                for row in scaled.cloud.iter_mut() {
+                    row[channel::MEAN].iter_mut().for_each(|v| *v *= scale as f32);
+                    row[channel::LOG_SCALE].iter_mut().for_each(|v| *v += (scale as f32).ln());
+                }
+                let shown = render_splats(&scaled, &camera(scale * eye), mode).unwrap();
+                assert!(apart(&usual, &shown) < 0.02, "{mode:?}, {scale}: {}", apart(&usual, &shown));
+            }
+        }
     }
 }

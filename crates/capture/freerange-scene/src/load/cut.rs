@@ -144,6 +144,10 @@ fn by_alpha_or_backdrop(
     match tried {
         Ok(images) => {
             let cut = images.iter().flatten().count();
+            if cut < images.len() {
+                let own = images.len() - cut;
+                notes.push(Note::understood(format!("masks are the alpha of {own} photos")));
+            }
             for (view, image) in views.iter_mut().zip(images) {
                 if let Some(image) = image {
                     view.image = image;

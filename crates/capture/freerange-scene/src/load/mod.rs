@@ -26,7 +26,7 @@ use crate::{
 };
 use aim::Aim;
 use cut::{Told, cut_all, plain, set_alpha};
-use freerange_util::{IoError, Note, Stop, beside, persist};
+use freerange_util::{IoError, Note, NoteKind, Stop, beside, persist};
 use image::{GrayImage, Luma};
 use mask_image::{colored, gray};
 use masks::{MaskFiles, Meaning, mask_files, meaning};
@@ -148,7 +148,7 @@ pub fn load(cameras: &Cameras, config: &LoadConfig) -> Result<Loaded, SceneError
     let mut pictures = pictures_of(cameras, &inputs, &masks, aim.as_ref(), config)?;
     tell(&pictures, cameras, &inputs, &mut notes);
     let usable = look_at_masks(cameras, &mut pictures, &masks, config, &mut notes)?;
-    without_rims(&mut pictures, config, &mut notes);
+    without_rims(&mut pictures, "photos", config, &mut notes);
     let mut names = vec![String::new(); cameras.photos.len()];
     for group in [&inputs, &further] {
         for (i, name) in group.iter().zip(short_names(&cameras.photos, group)) {
@@ -167,14 +167,27 @@ pub fn load(cameras: &Cameras, config: &LoadConfig) -> Result<Loaded, SceneError
         let found = format!("all {} cameras stand at one point; expected views from different places", views.len());
         return Err(In(&file).malformed("", found));
     }
-    let (kind, estimate) = cut_all(&mut views, &told, config, &mut notes)?;
+    let (kind, estimate) =
+        cut_all(&mut views, &told, config, &mut notes).map_err(|error| with_warnings(error, &notes))?;
     let mut compared = pictures_of(cameras, &further, &masks, aim.as_ref(), config)?;
     if usable {
         compared.iter_mut().for_each(Picture::only_usable);
     }
-    without_rims(&mut compared, config, &mut Vec::new());
+    without_rims(&mut compared, "photos to compare with", config, &mut notes);
     let further = further_views(compared, &further, &names, &mut notes);
     Ok(Loaded { views, photos: inputs, whole, further, masks: kind, estimate, notes })
+}
+
+/// Where the object was not found, what was warned of before may be why.
+fn with_warnings(error: SceneError, notes: &[Note]) -> SceneError {
+    let warnings = notes.iter().filter(|note| note.kind == NoteKind::Warning).map(|note| note.text.clone());
+    match error {
+        SceneError::NotCutOut { reason } => {
+            let all: Vec<String> = std::iter::once(reason).chain(warnings).collect();
+            SceneError::NotCutOut { reason: all.join("; ") }
+        }
+        other => other,
+    }
 }
 
 /// The photos of `which`: as many at once as [`memory::at_once`] allows.
@@ -260,8 +273,9 @@ fn look_at_masks(
     Ok(false)
 }
 
-/// Transparency that is the same in all photos, and only a rim, is what undistorting them left; it is not the object's outline.
-fn without_rims(pictures: &mut [Picture], config: &LoadConfig, notes: &mut Vec<Note>) {
+/// Transparency that is the same in all photos, and only a rim, is what undistorting them left; it is not the object's outline. `what`: what
+/// notes call the photos.
+fn without_rims(pictures: &mut [Picture], what: &str, config: &LoadConfig, notes: &mut Vec<Note>) {
     if config.masks == MaskSource::Alpha || !pictures.iter().any(|p| p.alpha) {
         return;
     }
@@ -282,7 +296,7 @@ fn without_rims(pictures: &mut [Picture], config: &LoadConfig, notes: &mut Vec<N
     }
     if count > 0 {
         notes.push(Note::assumed(format!(
-            "the transparent rim of {count} photos is what undistorting them left, not the object's outline (--masks alpha if it is)"
+            "the transparent rim of {count} {what} is what undistorting them left, not the object's outline (--masks alpha if it is)"
         )));
     }
 }

@@ -267,7 +267,8 @@ pub fn cameras_with(path: &Path, config: &ReadConfig) -> Result<Cameras, SceneEr
     }
     cameras.root = root_of(path, cameras.format);
     different_files(&mut cameras)?;
-    if matches!(cameras.format, Format::Colmap | Format::Metashape | Format::Realitycapture | Format::Opf) {
+    // One of several descriptions in a folder has a part of its photos.
+    if cameras.format != Format::Transforms || metadata.is_dir() {
         cameras.notes.extend(without_camera(&cameras.photos));
     }
     cameras.settle_origin();
@@ -309,16 +310,30 @@ fn different_files(cameras: &mut Cameras) -> Result<(), SceneError> {
 /// A note on the images that lie beside the photos and have no camera: programs do not manage to place them all.
 fn without_camera(photos: &[Photo]) -> Option<Note> {
     let folders: BTreeSet<&Path> = photos.iter().filter_map(|p| p.image.parent()).collect();
-    let known: BTreeSet<&Path> = photos.iter().map(|p| p.image.as_path()).collect();
+    let files = photos.iter().flat_map(|p| [Some(&p.image), p.mask.as_ref()]).flatten();
+    let known: BTreeSet<&Path> = files.map(PathBuf::as_path).collect();
     let there = folders.into_iter().filter_map(|f| entries(f).ok()).flatten();
     let left: Vec<String> = there
-        .filter(|p| has_extension(p, &IMAGES) && !known.contains(p.as_path()))
+        .filter(|p| has_extension(p, &IMAGES) && !known.contains(p.as_path()) && !goes_with_one(p, &known))
         .filter_map(|p| p.file_name().map(|n| n.to_string_lossy().into_owned()))
         .collect();
     let more = if left.len() > 6 { ", ..." } else { "" };
     let names = left.iter().take(6).cloned().collect::<Vec<_>>().join(", ");
     (!left.is_empty())
         .then(|| Note::dropped(format!("{} photos have no camera and are left out: {names}{more}", left.len())))
+}
+
+/// Whether a file is the mask, depth or normals of a photo beside it: `NAME.jpg.png`, `NAME.mask.png`, `NAME_depth_0001.png`.
+fn goes_with_one(file: &Path, photos: &BTreeSet<&Path>) -> bool {
+    let Some(own) = file.file_stem().map(|s| s.to_string_lossy().into_owned()) else { return false };
+    let words = [".mask", "_mask", "_depth", "_normal"];
+    let whose = words.iter().find_map(|word| own.split_once(word)).map(|(name, _)| name);
+    let named = |name: &str| photos.contains(file.with_file_name(name).as_path());
+    let with_extension = |name: &str| IMAGES.iter().any(|end| named(&format!("{name}.{end}")));
+    match whose {
+        Some(name) => named(name) || with_extension(name),
+        None => named(&own),
+    }
 }
 
 fn read(format: Format, file: &Path, images: Option<&Path>) -> Result<Cameras, SceneError> {

@@ -107,6 +107,47 @@ pub fn calibrated(file: &Path, bytes: &[u8]) -> Result<Vec<Calibrated>, SceneErr
     Ok(cameras)
 }
 
+/// The path that a URI means: `file://` and escapes taken away. What is no valid URI stays as it is.
+fn path_of(uri: &str) -> String {
+    let uri = uri.strip_prefix("file://").unwrap_or(uri);
+    let (mut bytes, mut rest) = (Vec::with_capacity(uri.len()), uri.as_bytes());
+    while let [first, tail @ ..] = rest {
+        let digit = |i: usize| tail.get(i).and_then(|d| char::from(*d).to_digit(16));
+        match digit(0).zip(digit(1)).filter(|_| *first == b'%') {
+            Some((high, low)) => {
+                bytes.push((16 * high + low) as u8);
+                rest = &tail[2..];
+            }
+            None => {
+                bytes.push(*first);
+                rest = tail;
+            }
+        }
+    }
+    String::from_utf8(bytes).unwrap_or_else(|_| uri.to_owned())
+}
+
+/// Reads `camera_list.json`: the URI of each camera's image, by the camera's number.
+pub fn uris(file: &Path, bytes: &[u8]) -> Result<HashMap<u64, String>, SceneError> {
+    let root = json(file, bytes)?;
+    let mut uris = HashMap::new();
+    for (i, camera) in list(file, &root, "cameras")?.iter().enumerate() {
+        let place = format!("camera {i}");
+        let uri = camera["uri"].as_str().ok_or_else(|| In(file).field(&place, "uri", "a path", &camera["uri"]))?;
+        let number = id(file, &place, camera, "id")?;
+        if uris.insert(number, uri.to_owned()).is_some() {
+            return Err(In(file).field(&place, "id", "a number of its own", number));
+        }
+    }
+    Ok(uris)
+}
+
+/// Reads `project.opf`: its calibrated cameras and its list of cameras, both in its folder.
+pub fn project(file: &Path, bytes: &[u8]) -> Result<[PathBuf; 2], SceneError> {
+    let root = json(file, bytes)?;
+    Ok([resource(file, &root, CALIBRATED)?, resource(file, &root, LIST)?])
+}
+
 /// The file of this kind that a project names, relative to it.
 fn resource(project: &Path, root: &Value, kind: &str) -> Result<PathBuf, SceneError> {
     let items = list(project, root, "items")?.iter();
@@ -116,20 +157,13 @@ fn resource(project: &Path, root: &Value, kind: &str) -> Result<PathBuf, SceneEr
         return Err(In(project).field("items", kind, "one resource of this format", "none, or several"));
     };
     let folder = project.parent().unwrap_or(Path::new(""));
-    super::inside(folder, uri).ok_or_else(|| In(project).field("items", "uri", "a file beside the project", uri))
+    super::inside(folder, &path_of(uri))
+        .ok_or_else(|| In(project).field("items", "uri", "a file beside the project", uri))
 }
 
 pub(super) fn read(file: &Path, images: Option<&Path>) -> Result<Cameras, SceneError> {
-    let root = json(file, &bytes_of(file)?)?;
-    let (cameras_file, list_file) = (resource(file, &root, CALIBRATED)?, resource(file, &root, LIST)?);
-    let names = json(&list_file, &bytes_of(&list_file)?)?;
-    let mut uris = HashMap::new();
-    for (i, camera) in list(&list_file, &names, "cameras")?.iter().enumerate() {
-        let place = format!("camera {i}");
-        let uri =
-            camera["uri"].as_str().ok_or_else(|| In(&list_file).field(&place, "uri", "a path", &camera["uri"]))?;
-        uris.insert(id(&list_file, &place, camera, "id")?, uri);
-    }
+    let [cameras_file, list_file] = project(file, &bytes_of(file)?)?;
+    let uris = uris(&list_file, &bytes_of(&list_file)?)?;
     let mut found = Photos::beside(file, images);
     let mut photos = Vec::new();
     for (i, camera) in calibrated(&cameras_file, &bytes_of(&cameras_file)?)?.into_iter().enumerate() {
@@ -137,12 +171,12 @@ pub(super) fn read(file: &Path, images: Option<&Path>) -> Result<Cameras, SceneE
         let Some(uri) = uris.get(&camera.id) else {
             return Err(In(&list_file).field("", "cameras", &format!("a file for camera {}", camera.id), "none"));
         };
-        let Some(image) = found.find(uri.trim_start_matches("file://"))? else { continue };
+        let Some(image) = found.find(&path_of(uri))? else { continue };
         let (w, h) = size_of(&image)?;
         let pose = world_to_camera(&cameras_file, &place, camera.axes, camera.center)?;
         let pinhole = pinhole(&cameras_file, &place, (w.into(), h.into()), [camera.focal; 2], camera.principal, pose)?;
         let (intrinsics, lens) = (Intrinsics::Pixels(pinhole), camera.lens);
-        photos.push(Photo { name: (*uri).to_owned(), image, mask: None, intrinsics, lens, further: false });
+        photos.push(Photo { name: path_of(uri), image, mask: None, intrinsics, lens, further: false });
     }
     let mut notes =
         vec![Note::understood("results are in the project's processing frame, before its shift to the ground")];

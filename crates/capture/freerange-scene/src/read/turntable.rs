@@ -6,6 +6,8 @@ use crate::{SceneError, error::In};
 use freerange_util::Note;
 use glam::DVec3;
 use std::{
+    collections::HashSet,
+    ffi::OsString,
     path::{Path, PathBuf},
     str::FromStr,
 };
@@ -46,18 +48,20 @@ impl FromStr for Turntable {
 /// Distance of the cameras from the object: any will do, as nothing tells sizes.
 const DISTANCE: f64 = 1.75;
 
-/// The photos of a folder, or of its `images`.
+/// The photos of a folder, or of its `images`. One of a kind that is not read is an error: it would be missing among the others. Raw files
+/// beside photos of the same name are passed over.
 pub fn photos_in(folder: &Path) -> Result<Vec<PathBuf>, SceneError> {
     let inner = folder.join("images");
     let folder = if inner.is_dir() { inner } else { folder.to_path_buf() };
     let there = entries(&folder)?;
     let images: Vec<_> = there.iter().filter(|p| p.is_file() && has_extension(p, &IMAGES)).cloned().collect();
-    if images.len() >= 3 {
-        return Ok(images);
-    }
-    match there.iter().find_map(|f| Some((f, unreadable_kind(f)?))) {
+    let stem = |path: &PathBuf| path.file_stem().unwrap_or_default().to_ascii_lowercase();
+    let known: HashSet<OsString> = images.iter().map(stem).collect();
+    let mut unread = there.iter().filter(|f| !known.contains(&stem(f)));
+    match unread.find_map(|f| Some((f, unreadable_kind(f)?))) {
         Some((file, kind)) => Err(In(file).unreadable(kind)),
-        None => Err(SceneError::TooFew { file: folder, expected: 3, found: images.len() }),
+        None if images.len() < 3 => Err(SceneError::TooFew { file: folder, expected: 3, found: images.len() }),
+        None => Ok(images),
     }
 }
 

@@ -3,7 +3,7 @@
 use std::{
     fs,
     path::{Path, PathBuf},
-    sync::PoisonError,
+    sync::{Arc, PoisonError, atomic::Ordering::Relaxed},
 };
 
 use freerange_gaussians::formats::{Format, Frame, WriteOptions, encode};
@@ -37,6 +37,36 @@ pub(super) fn forget_edits(folder: &Path, samples: usize) {
                 tracing::warn!("{}: {e}", file.display());
             }
         }
+    }
+}
+
+/// Bytes of memory that a byte of a result takes while it is read, converted and sent: formats of text take the most.
+const MEMORY_PER_BYTE: u64 = 8;
+
+/// Memory for a result, from before it is read until it is sent.
+pub struct Held {
+    board: Arc<Board>,
+    bytes: u64,
+}
+
+impl Held {
+    /// For sample `i` of a job. Refused while other results take all the memory that there is for them; one can always be had.
+    pub fn take(board: &Arc<Board>, id: &str, i: usize) -> Result<Self, Refusal> {
+        let (folder, ..) = board.with_sample(id, i)?;
+        let size = |file: PathBuf| fs::metadata(file).map_or(0, |data| data.len());
+        let bytes = MEMORY_PER_BYTE * size(sample_file(&folder, i)).max(size(whole_file(&folder, i)));
+        let before = board.held.fetch_add(bytes, Relaxed);
+        let held = Self { board: board.clone(), bytes };
+        match before == 0 || before + bytes <= board.limits.memory {
+            true => Ok(held),
+            false => Err(Refusal::new(503, "the server sends other results now: try again in a moment")),
+        }
+    }
+}
+
+impl Drop for Held {
+    fn drop(&mut self) {
+        self.board.held.fetch_sub(self.bytes, Relaxed);
     }
 }
 

@@ -89,7 +89,8 @@ impl Board {
                             .iter()
                             .map(|(seed, c)| SampleRecord { seed: *seed, gaussians: c.len() })
                             .collect();
-                        (r.up, r.notes, r.seconds, r.state) = (outcome.up, outcome.notes, outcome.seconds, State::Done);
+                        r.notes = outcome.notes.iter().map(|note| plain::sentence(note, &folder)).collect();
+                        (r.up, r.seconds, r.state) = (outcome.up, outcome.seconds, State::Done);
                     }
                     Err(_) if stopping => {
                         r.error =

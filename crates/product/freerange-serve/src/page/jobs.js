@@ -1,4 +1,4 @@
-// All jobs: which one is shown, hearing of it, starting, cancelling, renaming, removing it.
+// All jobs: which one is shown, hearing of it, starting and cancelling it.
 /**
  * @typedef {import("./state.js").Status} Status
  */
@@ -14,7 +14,7 @@ const AGAIN = 3000;
 let source = null;
 
 /** @param {string} id */
-const reload = async (id) => {
+export const reload = async (id) => {
   const found = await call("GET", `/jobs/${id}`);
   if (location.hash !== `#job=${id}`) return;
   const wasHere = app.job?.id === id;
@@ -60,11 +60,16 @@ const listen = (id) => {
   });
 };
 
+/** Hears no more of a job. */
+export const leave = () => {
+  source?.close();
+  source = null;
+};
+
 /** Shows the job that the address names, and hears of it from now on. */
 export const open = async () => {
   const id = /^#job=([0-9a-f]{16})$/.exec(location.hash)?.[1];
-  source?.close();
-  source = null;
+  leave();
   app.drawn = 0;
   if (!id) {
     app.job = null;
@@ -114,53 +119,4 @@ button("cancel").addEventListener("click", () => void attempt(async () => {
   await call("POST", `/jobs/${app.job.id}/cancel`);
   // This button is gone now.
   box("job-title").focus();
-}));
-
-// --- Rename, remove, undo ------------------------------------------------------------------------------------------------
-
-const renaming = get("rename-dialog", HTMLDialogElement), removing = get("remove-dialog", HTMLDialogElement);
-button("rename").addEventListener("click", () => {
-  input("new-title").value = app.job?.title ?? "";
-  renaming.showModal();
-  input("new-title").select();
-});
-get("rename-form", HTMLFormElement).addEventListener("submit", (e) => {
-  e.preventDefault();
-  renaming.close();
-  void attempt(async () => {
-    if (!app.job) return;
-    await call("PUT", `/jobs/${app.job.id}/title`, JSON.stringify({ title: input("new-title").value }));
-    await reload(app.job.id);
-  });
-});
-button("rename-close").addEventListener("click", () => renaming.close());
-
-button("remove").addEventListener("click", () => {
-  box("remove-title").textContent = `Remove ${app.job?.title || "this object"}?`;
-  removing.showModal();
-});
-button("remove-no").addEventListener("click", () => removing.close());
-/** @type {?string} */
-let removed = null;
-button("remove-yes").addEventListener("click", () => void attempt(async () => {
-  removing.close();
-  if (!app.job) return;
-  const { id, title } = app.job;
-  source?.close();
-  source = null;
-  await call("DELETE", `/jobs/${id}`);
-  removed = id;
-  box("removed-text").textContent = `${title || "The object"} was removed.`;
-  box("removed").hidden = false;
-  // The focused button is gone: what one may want next has the focus.
-  button("undo").focus();
-  location.hash = "";
-}));
-button("undo").addEventListener("click", () => void attempt(async () => {
-  if (!removed) return;
-  await call("POST", `/jobs/${removed}/restore`);
-  box("removed").hidden = true;
-  location.hash = `job=${removed}`;
-  removed = null;
-  box("main").focus();
 }));

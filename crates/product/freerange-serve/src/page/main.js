@@ -2,6 +2,7 @@
 import { attempt, box, call } from "./dom.js";
 import { open } from "./jobs.js";
 import "./record.js";
+import "./remove.js";
 import { offerExample, tellLimits } from "./send.js";
 import { app } from "./state.js";
 

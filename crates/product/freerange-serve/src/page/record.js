@@ -114,7 +114,8 @@ const animation = async () => {
 button("gif").addEventListener("click", () => void attempt(animation));
 
 button("link").addEventListener("click", () => void attempt(async () => {
-  await navigator.clipboard.writeText(location.href);
-  complain("The address of this object is copied. Whoever opens it needs the token of this server.");
+  // Pages without encryption have no clipboard.
+  const copied = await navigator.clipboard?.writeText(location.href).then(() => true, () => false);
+  complain(`The address of this object${copied ? " is copied" : `: ${location.href}`}. Whoever opens it needs the token of this server.`);
 }));
 toolbar(box("film-tools"));

@@ -31,7 +31,7 @@ pub struct Description {
     pub notes: Vec<String>,
     /// The poses are in COLMAP's arbitrary frame, whose axes were only exchanged (nerfstudio's `applied_transform`): +z need not be up.
     pub any_up: bool,
-    /// `train_filenames`, where the file has it, as [`plain_path`] spells them.
+    /// `train_filenames`, as [`plain_path`] spells them, or what is in no other list; none where the file has no list.
     train: Option<HashSet<String>>,
 }
 
@@ -87,11 +87,7 @@ impl Description {
             .map(|(i, frame)| FrameDescription::read(frame, root, folder, Place { frame: Some(i), ..place.clone() }))
             .collect::<Result<_, _>>()?;
         different_names(&mut frames)?;
-        let train: Option<HashSet<String>> = match root.get("train_filenames") {
-            None | Some(Value::Null) => None,
-            Some(Value::Array(names)) => Some(names.iter().filter_map(|n| n.as_str().map(plain_path)).collect()),
-            other => return Err(field(&place, "train_filenames", "a list of file names", found(other))),
-        };
+        let mut train = listed(root, "train_filenames", &place)?;
         let mut any_up = false;
         let mut notes = Vec::new();
         let ours: HashSet<&str> = frames.iter().map(|f| f.written.as_str()).collect();
@@ -107,6 +103,13 @@ impl Description {
                 }
                 None => {}
             }
+        }
+        let mut held = listed(root, "test_filenames", &place)?.unwrap_or_default();
+        held.extend(listed(root, "val_filenames", &place)?.unwrap_or_default());
+        if train.is_none() && ours.iter().any(|name| held.contains(*name)) {
+            let file = file.display();
+            notes.push(format!("{file}: frames of `test_filenames` and `val_filenames` are only compared with"));
+            train = Some(ours.iter().filter(|name| !held.contains(**name)).map(|name| (*name).to_owned()).collect());
         }
         if root.get("applied_transform").is_some_and(|v| !v.is_null()) {
             any_up = root.get("orientation_override").and_then(Value::as_str) != Some("none");
@@ -329,6 +332,15 @@ impl Fields<'_> {
             }
         }
         Ok(())
+    }
+}
+
+/// The names in a list of the whole file, as [`plain_path`] spells them; none where there is no such list.
+fn listed(root: &Map<String, Value>, list: &str, place: &Place) -> Result<Option<HashSet<String>>, CameraError> {
+    match root.get(list) {
+        None | Some(Value::Null) => Ok(None),
+        Some(Value::Array(names)) => Ok(Some(names.iter().filter_map(|n| n.as_str().map(plain_path)).collect())),
+        other => Err(field(place, list, "a list of file names", found(other))),
     }
 }
 
