@@ -53,7 +53,7 @@ def main():
         if part is None:
             rest[symbol] += count
     print("| stage | seconds |\n|---|---|")
-    for stage, seconds in report["seconds"].items():
+    for stage, seconds in report["seconds"]:
         print(f"| {stage} | {seconds:.1f} |")
     print("\n| part | share of processor time |\n|---|---|")
     for part, count in parts.most_common():
