@@ -7,7 +7,7 @@ use std::{
 
 use freerange::{Scene, SceneConfig, Up};
 use freerange_scene::{
-    LoadConfig, MaskModel, MaskSource, PixelRange,
+    KeepWhole, LoadConfig, MaskModel, MaskSource, PixelRange,
     estimate::Hints,
     files,
     read::{Cameras, Format, ReadConfig, Turntable, cameras_with},
@@ -185,12 +185,13 @@ impl Photos {
         ]
     }
 
-    /// Reads a scene.
-    pub fn load(&self, cameras: Cameras, up: UpChoice) -> Result<Scene, CliError> {
+    /// Reads a scene; `whole`: what is kept of whole photos.
+    pub fn load(&self, cameras: Cameras, up: UpChoice, whole: KeepWhole) -> Result<Scene, CliError> {
         let up = match up {
             UpChoice::Told(up) => Some(up),
             UpChoice::Auto => None,
         };
-        Ok(Scene::load(cameras, &SceneConfig { photos: self.config(), up, ..SceneConfig::default() })?)
+        let photos = LoadConfig { whole, ..self.config() };
+        Ok(Scene::load(cameras, &SceneConfig { photos, up, ..SceneConfig::default() })?)
     }
 }

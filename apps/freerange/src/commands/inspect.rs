@@ -5,10 +5,10 @@ use std::path::PathBuf;
 use freerange::{
     choose_views,
     internal::{Settings, checkpoint_header},
-    to_canonical,
 };
-use freerange_scene::camera::transforms_json;
+use freerange_scene::camera::{canonical_from_user, transforms_json};
 use freerange_scene::{
+    KeepWhole,
     inspect::{Inspection, inspect, sheet},
     write_masks,
 };
@@ -50,9 +50,17 @@ pub struct Args {
     json: bool,
 }
 
+/// Whole photos that are kept in memory.
+const MOST_IN_MEMORY: usize = 64;
+
 /// Runs the command.
 pub fn run(args: &Args) -> Result<(), CliError> {
-    let scene = args.photos.load(args.photos.cameras(&args.scene)?, args.up)?;
+    let cameras = args.photos.cameras(&args.scene)?;
+    // Files where there are many: whole photos would take as much memory again as those that are cut out.
+    let folder = (cameras.photos.len() > MOST_IN_MEMORY).then(tempfile::tempdir).transpose();
+    let folder = folder.map_err(CliError::failure)?;
+    let whole = folder.as_ref().map_or(KeepWhole::Memory, |folder| KeepWhole::Folder(folder.path().into()));
+    let scene = args.photos.load(cameras, args.up, whole)?;
     let views = match args.views {
         Some(k) => usize::from(k),
         None => {
@@ -60,7 +68,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
             Settings::of(&checkpoint_header(checkpoint.as_deref())?.provenance)?.network_views
         }
     };
-    let (frame, _) = to_canonical(&scene.loaded.views, &scene.frame)?;
+    let frame = canonical_from_user(&scene.loaded.views, &scene.frame)?;
     let shown = choose_views(&scene.loaded.views, views)?;
     let found = inspect(&scene.cameras, &scene.loaded, &scene.notes, &frame, &shown);
     let output = OutputFolder::create("inspect", &args.output)?;

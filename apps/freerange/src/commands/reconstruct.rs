@@ -24,7 +24,7 @@ use freerange_scene::camera::{
     FrameConfig, canonical_from_user,
     image_ops::{sheet, to_picture},
 };
-use freerange_scene::views_to_compare;
+use freerange_scene::{KeepWhole, views_to_compare};
 use freerange_util::{Note, NoteKind};
 use serde::Serialize;
 
@@ -227,7 +227,7 @@ fn run_in(args: &Args, job: &Job) -> Result<(), CliError> {
     // What cannot be done is refused before photos are read and cut out.
     args.pipeline.options(&model, args.samples)?;
     let program = Program::of(&model, args.pipeline.checkpoint_sha256()?);
-    let scene = args.photos.load(args.photos.cameras(path)?, args.pipeline.up)?;
+    let scene = args.photos.load(args.photos.cameras(path)?, args.pipeline.up, KeepWhole::Small)?;
     let (report, json) = reconstruct(args, path, scene, &model, &program, &args.output, begin, || Ok(()))?;
     match args.json {
         true => {
@@ -343,8 +343,10 @@ fn write_sample(
     let place = Place { output, suffix: &suffix, frame, origin: origin.unwrap_or_default() };
     notes.extend(place.write(&splats, formats, inputs)?);
     write_turntable(&output.path(&format!("turntable{suffix}.gif"))?, &sample.canonical, 48, 256)?;
-    for (view, picture) in comparisons(&sample.gaussians, inputs)? {
-        output.picture(&format!("inputs{suffix}/{view}.png"), &picture)?;
+    for view in inputs {
+        // A view's name may hold folders: keep its last part.
+        let name = view.name.rsplit(['/', '\\']).next().unwrap_or("view");
+        output.picture(&format!("inputs{suffix}/{name}.png"), &comparison(&sample.gaussians, view)?)?;
     }
     let before_optimization = match &sample.before_optimization {
         None => None,
@@ -368,18 +370,11 @@ fn in_scene(from_local: &freerange::Similarity, origin: Option<[f64; 3]>) -> fre
     from_local.after(&shift)
 }
 
-/// Each input image beside its render.
-fn comparisons(cloud: &freerange::Gaussians, views: &[View]) -> Result<Vec<(String, image::RgbaImage)>, CliError> {
-    views
-        .iter()
-        .map(|view| {
-            let (w, h) = view.image.dimensions();
-            let render = to_picture(&render_view(cloud, &view.camera)?, w, h);
-            // A view's name may hold folders: keep its last part.
-            let name = view.name.rsplit(['/', '\\']).next().unwrap_or("view").to_owned();
-            Ok((name, sheet(&[vec![on_white(&view.image), render]])))
-        })
-        .collect()
+/// An input image beside its render.
+fn comparison(cloud: &freerange::Gaussians, view: &View) -> Result<image::RgbaImage, CliError> {
+    let (w, h) = view.image.dimensions();
+    let render = to_picture(&render_view(cloud, &view.camera)?, w, h);
+    Ok(sheet(&[vec![on_white(&view.image), render]]))
 }
 
 /// Notes and warnings, on standard error.

@@ -3,6 +3,8 @@
 //! Images store straight alpha. Whatever mixes pixels mixes them premultiplied, so that the color of transparent
 //! pixels never bleeds into the result.
 
+use std::collections::VecDeque;
+
 use image::{Rgba, RgbaImage};
 
 const TO_UNIT: f32 = 1.0 / 255.0;
@@ -96,6 +98,20 @@ fn taps(from: usize, to: usize) -> Vec<Tap> {
         .collect()
 }
 
+/// A row of pixels at another width, premultiplied: in units of 255 * 255, alpha of 255.
+fn narrow(row: &[[u8; 4]], across: &[Tap], target: &mut [[f32; 4]]) {
+    for (tap, t) in across.iter().zip(target) {
+        *t = [0.0; 4];
+        for (p, &weight) in row[tap.first..].iter().zip(&tap.weights) {
+            let wa = weight * f32::from(p[3]);
+            t[0] += wa * f32::from(p[0]);
+            t[1] += wa * f32::from(p[1]);
+            t[2] += wa * f32::from(p[2]);
+            t[3] += wa;
+        }
+    }
+}
+
 /// The image at another size: the area average where it shrinks, linear interpolation where it grows, each axis by
 /// itself, in premultiplied alpha. Fully transparent results are black. Zero sizes give an empty image.
 pub fn resize_area(image: &RgbaImage, width: u32, height: u32) -> RgbaImage {
@@ -111,23 +127,24 @@ pub fn resize_area(image: &RgbaImage, width: u32, height: u32) -> RgbaImage {
     let (across, down) = (taps(w, nw), taps(h, nh));
     let source = image.as_raw().as_chunks::<4>().0;
 
-    // Along the rows first: [h, nw] of (a r, a g, a b, a), in units of 255 * 255 and 255.
-    let mut narrow = vec![[0.0f32; 4]; h * nw];
-    for (row, target) in source.chunks_exact(w).zip(narrow.chunks_exact_mut(nw)) {
-        for (tap, t) in across.iter().zip(target) {
-            for (p, &weight) in row[tap.first..].iter().zip(&tap.weights) {
-                let wa = weight * f32::from(p[3]);
-                t[0] += wa * f32::from(p[0]);
-                t[1] += wa * f32::from(p[1]);
-                t[2] += wa * f32::from(p[2]);
-                t[3] += wa;
-            }
-        }
-    }
+    // Along the rows first. Narrowed rows, [nw] of (a r, a g, a b, a) in units of 255 * 255 and 255, are made when they are
+    // needed and kept as long: all of a photo's would take as much memory as the photo.
+    let (mut kept, mut first) = (VecDeque::<Vec<[f32; 4]>>::new(), 0);
     let mut sums = vec![[0.0f32; 4]; nw];
     for (tap, target) in down.iter().zip(out.as_chunks_mut::<4>().0.chunks_exact_mut(nw)) {
+        let mut spare = Vec::new();
+        while first < tap.first {
+            spare.extend(kept.pop_front());
+            first += 1;
+        }
+        while kept.len() < tap.weights.len() {
+            let number = first + kept.len();
+            let mut row = spare.pop().unwrap_or_else(|| vec![[0.0; 4]; nw]);
+            narrow(&source[number * w..][..w], &across, &mut row);
+            kept.push_back(row);
+        }
         sums.fill([0.0; 4]);
-        for (row, &weight) in narrow[tap.first * nw..].chunks_exact(nw).zip(&tap.weights) {
+        for (row, &weight) in kept.iter().zip(&tap.weights) {
             for (s, v) in sums.iter_mut().zip(row) {
                 for c in 0..4 {
                     s[c] += weight * v[c];

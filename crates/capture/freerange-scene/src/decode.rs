@@ -22,6 +22,21 @@ pub(crate) struct Decoded {
 /// Decodes a file.
 pub(crate) fn decode(path: &Path) -> Result<Decoded, SceneError> {
     let failed = |e| SceneError::Image { file: path.into(), source: Box::new(e) };
+    let mut decoder = decoder(path)?;
+    let orientation = decoder.orientation().map_err(failed)?;
+    // What cannot be read of a profile changes no color.
+    let profile = decoder.icc_profile().ok().flatten();
+    let mut image = DynamicImage::from_decoder(decoder).map_err(failed)?.into_rgba8();
+    let converted = profile.is_some_and(|profile| to_srgb(&mut image, &profile));
+    Ok(Decoded { image, orientation, converted })
+}
+
+/// Whether a file may have transparent pixels, from its beginning.
+pub(crate) fn has_alpha(path: &Path) -> Result<bool, SceneError> {
+    Ok(decoder(path)?.color_type().has_alpha())
+}
+
+fn decoder(path: &Path) -> Result<impl ImageDecoder + use<>, SceneError> {
     let mut limits = image::Limits::default();
     limits.max_image_width = Some(LARGEST_SIDE);
     limits.max_image_height = Some(LARGEST_SIDE);
@@ -32,13 +47,7 @@ pub(crate) fn decode(path: &Path) -> Result<Decoded, SceneError> {
     if let Some(kind) = kind_of(path) {
         return Err(In(path).unreadable(kind));
     }
-    let mut decoder = reader.into_decoder().map_err(failed)?;
-    let orientation = decoder.orientation().map_err(failed)?;
-    // What cannot be read of a profile changes no color.
-    let profile = decoder.icc_profile().ok().flatten();
-    let mut image = DynamicImage::from_decoder(decoder).map_err(failed)?.into_rgba8();
-    let converted = profile.is_some_and(|profile| to_srgb(&mut image, &profile));
-    Ok(Decoded { image, orientation, converted })
+    reader.into_decoder().map_err(|e| SceneError::Image { file: path.into(), source: Box::new(e) })
 }
 
 /// The kind of an image that is not decoded, by the file's first bytes: cameras and messengers rename files.

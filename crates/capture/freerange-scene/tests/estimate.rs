@@ -1,9 +1,12 @@
 //! Masks from poses and colors: on a scene drawn here, on broken poses, and on the photo-like scenes of the shared folder.
 
-use freerange_scene::camera::{Camera, View};
+use freerange_scene::camera::{Camera, View, image_ops::resize_area};
 use freerange_scene::{
     LoadConfig, MaskSource, SceneError,
-    estimate::{Hints, LeaveOneOut, agreement, confirmed, contradictions, masks, overlap, table_faces},
+    estimate::{
+        Estimate, Hints, LeaveOneOut, agreement, confirmed, contradictions, masks, overlap, table_faces,
+        unjudged_keeping,
+    },
     load,
     read::cameras,
 };
@@ -73,7 +76,11 @@ fn draw(camera: &Camera) -> (RgbaImage, Vec<bool>) {
 
 /// Eight views by hand: around the object, not quite aimed at it.
 fn scene() -> (Vec<View>, Vec<Vec<bool>>) {
-    (0..8)
+    around(8)
+}
+
+fn around(count: u32) -> (Vec<View>, Vec<Vec<bool>>) {
+    (0..count)
         .map(|i| {
             let i = f64::from(i);
             let (azimuth, elevation) = (0.8 * i + 0.2 * (3.0 * i).sin(), 0.45 + 0.2 * (2.0 * i).sin());
@@ -131,7 +138,7 @@ fn the_same_photos_give_the_same_masks() {
 }
 
 /// What the others would show, were they to know all: where the object is, and the color that it has there.
-fn truth_shown(views: &[View], _: &Stop) -> Result<Vec<RgbaImage>, String> {
+fn truth_shown(views: Vec<View>, _: &Stop) -> Result<Vec<RgbaImage>, String> {
     let shown = |v: &View| {
         let (mut image, (_, mask)) = (v.image.clone(), draw(&v.camera));
         image.pixels_mut().zip(mask).for_each(|(p, m)| p[3] = if m { 255 } else { 0 });
@@ -183,6 +190,23 @@ fn masks_stay_as_they_are_where_other_views_show_nothing() {
     // Too few for the others to know anything: they are not asked.
     let never: LeaveOneOut = |_, _| panic!("asked");
     assert_eq!(of(&views[..4], Some(never)).alpha, of(&views[..4], None).alpha);
+}
+
+/// Of many views only what others are compared with is kept, and the rest is made again: the same. Fourteen of these views are asked by others.
+#[test]
+fn what_is_not_kept_of_views_is_made_again() {
+    let half = |view: View| {
+        let (w, h) = (W / 2, H / 2);
+        View { camera: view.camera.resized(w, h), image: resize_area(&view.image, w, h), ..view }
+    };
+    let views: Vec<View> = around(18).0.into_iter().map(half).collect();
+    let shown: LeaveOneOut = |views, _| Ok(views.into_iter().map(|view| view.image).collect());
+    let of = |kept: usize| {
+        let found = unjudged_keeping(kept, &views, &Hints { others: Some(shown), ..Hints::default() }).unwrap();
+        let Estimate { alpha, agreement, clearness, up, evidence, notes } = found;
+        ((alpha, agreement, clearness), (up, evidence, notes))
+    };
+    assert!(of(18) == of(17));
 }
 
 #[track_caller]

@@ -8,7 +8,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use freerange_scene::{LoadConfig, MaskSource, SceneError, load, read::cameras};
+use freerange_scene::{KeepWhole, LoadConfig, MaskSource, SceneError, load, read::cameras};
 use freerange_util::{Stop, Stopped};
 use image::RgbaImage;
 use serde_json::Value;
@@ -52,8 +52,11 @@ fn reading_takes_what_was_foretold_and_ends_when_it_is_stopped() {
     let folder = tempfile::tempdir().unwrap();
     scene(folder.path());
     let found = cameras(folder.path(), None, None).unwrap();
-    let config =
-        |masks: MaskSource| LoadConfig { masks, whole_folder: Some(folder.path().into()), ..LoadConfig::default() };
+    let config = |masks: MaskSource| LoadConfig {
+        masks,
+        whole: KeepWhole::Folder(folder.path().into()),
+        ..LoadConfig::default()
+    };
     let needed = |masks: MaskSource| {
         let Err(SceneError::Memory { photos, limit: 1, needed }) =
             load(&found, &LoadConfig { memory: 1 << 20, ..config(masks) })

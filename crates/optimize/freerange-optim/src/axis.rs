@@ -7,7 +7,7 @@ use freerange_scene::camera::{Camera, View};
 use glam::{DMat4, DVec3};
 
 use crate::{
-    Evidence, FitError, InitialFitConfig, Silhouette,
+    Evidence, FitError, InitialFitConfig, PosedImage,
     search::{Hull, OUTLINE, PICTURE, Pictures, ROUNDS, Search, Symmetry, UNCOVERED, going_on, normals, place},
     views::Targets,
 };
@@ -126,12 +126,12 @@ pub fn find_axis(
     };
     let before = pictures.difference::<Axis>(own, None, f64::INFINITY)?;
     (_, axis) = put(own, axis, [0.04, 0.004])?;
-    let both = Evidence { views, silhouettes: turned(views, &axis) };
-    let Some(mut cloud) = search.fitted(None, both, config)? else { return Ok(None) };
+    let photos: Vec<PosedImage<'_>> = views.iter().map(PosedImage::from).collect();
+    let both = |axis: &Axis| Evidence { views: photos.clone(), silhouettes: turned(&photos, axis) };
+    let Some(mut cloud) = search.fitted(None, both(&axis), config)? else { return Ok(None) };
     for _ in 0..ROUNDS {
         (_, axis) = put(&cloud, axis, [0.01, 0.002])?;
-        let both = Evidence { views, silhouettes: turned(views, &axis) };
-        let Some(next) = search.fitted(Some(&cloud), both, &going_on(config))? else { return Ok(None) };
+        let Some(next) = search.fitted(Some(&cloud), both(&axis), &going_on(config))? else { return Ok(None) };
         cloud = next;
     }
     let contradiction = pictures.difference::<Axis>(&cloud, None, f64::INFINITY)? / before.max(f64::MIN_POSITIVE);
@@ -139,11 +139,10 @@ pub fn find_axis(
 }
 
 /// The silhouettes of the views, turned all around the axis.
-pub fn turned<'a>(views: &'a [View], axis: &Axis) -> Vec<Silhouette<'a>> {
-    let axis = *axis;
-    let turned = move |view: &'a View, i: u32| Silhouette {
-        camera: axis.camera(&view.camera, f64::from(i) / f64::from(TURNS)),
-        ..view.into()
+pub fn turned<'a>(views: &[PosedImage<'a>], axis: &Axis) -> Vec<PosedImage<'a>> {
+    let turned = |view: &PosedImage<'a>, i: u32| {
+        let camera = axis.camera(&view.camera, f64::from(i) / f64::from(TURNS));
+        PosedImage { camera, ..*view }
     };
     (1..TURNS).flat_map(|i| views.iter().map(move |view| turned(view, i))).collect()
 }
@@ -192,7 +191,7 @@ mod tests {
         let cloud = vase(true);
         let camera = cameras(3, 40, 0.0)[1];
         let view = photograph(&cloud, &camera);
-        let all = turned(std::slice::from_ref(&view), &AXIS);
+        let all = turned(&[(&view).into()], &AXIS);
         assert_eq!(all.len(), 7);
         let height = |camera: &Camera| (camera.center() - AXIS.point).dot(AXIS.direction);
         for (i, seen) in (1..8).zip(&all) {

@@ -30,13 +30,22 @@ pub fn fit<'a>(
     progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Gaussians, FitError> {
     config.check()?;
-    let targets = Targets::new(seen, config.render_size)?;
+    fit_targets(&Targets::new(seen, config.render_size)?, initial, config, progress)
+}
+
+/// [`fit`] of views at the size that they are compared at, with a configuration that is checked.
+pub(crate) fn fit_targets(
+    targets: &Targets,
+    initial: Option<&Gaussians>,
+    config: &FitConfig,
+    progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
+) -> Result<Gaussians, FitError> {
     let mut rng = ChaCha8Rng::seed_from_u64(config.seed);
     let cloud = match initial {
         Some(cloud) => checked(cloud, config.cap_max)?,
-        None => random_cloud(&targets, config, &mut rng),
+        None => random_cloud(targets, config, &mut rng),
     };
-    descend(cloud, |_| (&targets, 1.0), config, &mut rng, |_, _| Ok(Vec::new()), progress)
+    descend(cloud, |_| (targets, 1.0), config, &mut rng, |_, _| Ok(Vec::new()), progress)
 }
 
 /// The optimization itself. `of_step` is what each step compares with, at whatever size, and the part of each side of a view

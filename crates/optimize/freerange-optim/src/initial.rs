@@ -5,7 +5,12 @@ use std::ops::ControlFlow;
 use freerange_gaussians::{Alignment, Gaussians, LodTree};
 use serde::{Deserialize, Serialize};
 
-use crate::{Evidence, FitConfig, FitError, FitProgress, config::check, fit};
+use crate::{
+    Evidence, FitConfig, FitError, FitProgress,
+    config::check,
+    fit::{fit, fit_targets},
+    views::Targets,
+};
 
 /// Settings of [`initial_fit`].
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -52,7 +57,7 @@ impl InitialFitConfig {
 /// A short 3DGS-MCMC fit of what is `seen`, which lies in the canonical frame, from the visual hull of the masks.
 ///
 /// # Errors
-/// Those of [`fit`].
+/// Those of [`fit`](crate::fit()).
 pub fn initial_fit<'a>(
     seen: impl Into<Evidence<'a>>,
     config: &InitialFitConfig,
@@ -63,11 +68,44 @@ pub fn initial_fit<'a>(
     fit(seen, None, &config.config(seed), progress)
 }
 
+/// For each of some views an [`initial_fit`] of all the others. They are shrunk once for all of these fits, and not needed any more.
+pub struct LeaveOneOut {
+    targets: Targets,
+    config: InitialFitConfig,
+}
+
+impl LeaveOneOut {
+    /// # Errors
+    /// Those of [`fit`](crate::fit()).
+    pub fn new<'a>(seen: impl Into<Evidence<'a>>, config: &InitialFitConfig) -> Result<Self, FitError> {
+        config.check()?;
+        Ok(Self { targets: Targets::new(seen, Some(config.render_size))?, config: config.clone() })
+    }
+
+    /// The fit of all views but number `left_out`: the bytes of [`initial_fit`] of them.
+    ///
+    /// # Errors
+    /// Those of [`fit`](crate::fit()).
+    pub fn fit(
+        &self,
+        left_out: usize,
+        seed: u64,
+        progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
+    ) -> Result<Gaussians, FitError> {
+        let (targets, config) = (self.targets.without(left_out), self.config.config(seed));
+        if targets.views == 0 {
+            return Err(FitError::NoViews);
+        }
+        config.check()?;
+        fit_targets(&targets, None, &config, progress)
+    }
+}
+
 /// `cloud`, moved by as short a fit of what is `seen`: what a sample needs that the views do not look like. It keeps its
 /// number of Gaussians, whatever `config` says of that.
 ///
 /// # Errors
-/// Those of [`fit`].
+/// Those of [`fit`](crate::fit()).
 pub(crate) fn continue_fit<'a>(
     cloud: &Gaussians,
     seen: impl Into<Evidence<'a>>,

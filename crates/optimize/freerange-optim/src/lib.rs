@@ -36,11 +36,11 @@ pub use config::{AnchorConfig, Background, FitConfig, OptimizationConfig, Rates}
 pub use error::FitError;
 pub use fit::fit;
 pub use frame::frame_of;
-pub use initial::{InitialFitConfig, initial_fit, tree_slice};
+pub use initial::{InitialFitConfig, LeaveOneOut, initial_fit, tree_slice};
 pub use mirror::{FoundMirror, Mirror, find_mirror, mirror_steps, mirrored};
 pub use optimize::optimize;
 pub use quality::{over_white, psnr_over_white, render_over_white};
-pub use views::{Evidence, Silhouette};
+pub use views::{Evidence, PosedImage};
 
 use freerange_gaussians::Gaussians;
 

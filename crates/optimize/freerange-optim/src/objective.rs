@@ -210,7 +210,7 @@ pub(crate) fn normalize_rotations(cloud: &mut Gaussians) {
 mod tests {
     use super::*;
     use crate::{
-        AnchorConfig, Evidence, Silhouette,
+        AnchorConfig, Evidence, PosedImage,
         anchors::Anchors,
         tests::{ball, ring},
     };
@@ -277,7 +277,7 @@ mod tests {
         let mut views = ring(4, 24, &ball(12, 1));
         views[3] = ring(4, 40, &ball(12, 1)).remove(3);
         let targets = Targets::new(
-            Evidence { views: &views[..1], silhouettes: views[1..].iter().map(Silhouette::from).collect() },
+            Evidence { silhouettes: views[1..].iter().map(PosedImage::from).collect(), ..(&views[..1]).into() },
             Some(32),
         )
         .unwrap();

@@ -37,9 +37,9 @@ pub fn optimize<'a>(
 ) -> Result<Gaussians, FitError> {
     config.check()?;
     let seen = seen.into();
-    let targets = Targets::new(seen.views, config.render_size)?;
+    let targets = Targets::new(seen.views.clone(), config.render_size)?;
     let first = (config.coarse * config.steps as f64) as usize;
-    let coarse = (first > 0).then(|| Targets::new(seen.views, Some(config.coarse_size))).transpose()?;
+    let coarse = (first > 0).then(|| Targets::new(seen.views.clone(), Some(config.coarse_size))).transpose()?;
     let further = seen.silhouettes.len();
     let size = config.render_size.map_or(SILHOUETTES, |size| size.min(SILHOUETTES));
     let silhouettes = (further > 0).then(|| Targets::new(seen, Some(size))).transpose()?;

@@ -4,7 +4,7 @@ use crate::*;
 use crate::{anchors::Anchors, initial::continue_fit, views::Targets};
 use freerange_gaussians::{Gaussians, channel};
 use freerange_raster::{RasterConfig, render};
-use freerange_scene::camera::{Camera, View};
+use freerange_scene::camera::{Camera, View, Window};
 use glam::DVec3;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -102,21 +102,59 @@ fn silhouettes_share_pictures() {
     let from = cameras(3, 24, 1.0);
     let silhouettes = from.iter().zip([1, 0, 1]).map(|(camera, of)| {
         let (width, height) = views[of].image.dimensions();
-        Silhouette { camera: camera.resized(width, height), ..Silhouette::from(&views[of]) }
+        PosedImage { camera: camera.resized(width, height), ..PosedImage::from(&views[of]) }
     });
-    let targets = Targets::new(Evidence { views: &views, silhouettes: silhouettes.collect() }, Some(32)).unwrap();
+    let targets = Targets::new(Evidence { silhouettes: silhouettes.collect(), ..(&views).into() }, Some(32)).unwrap();
     assert_eq!((targets.views, targets.cameras.len()), (2, 5));
     for (i, (of, size)) in [(0, 24), (1, 32), (1, 32), (0, 24), (1, 32)].into_iter().enumerate() {
         let expected = freerange_scene::camera::image_ops::resize_area(&views[of].image, size, size);
-        assert_eq!(targets.images[i], expected, "{i}");
+        assert_eq!(*targets.images[i], expected, "{i}");
+        assert!(std::ptr::eq(&*targets.images[i], &*targets.images[of]), "{i}: held once");
         let camera = if i < 2 { views[of].camera } else { from[i - 2] };
         assert!(targets.cameras[i].world_to_camera == camera.world_to_camera, "{i}");
         let found = &targets.cameras[i];
         assert!(found.width == size && (found.fx - camera.resized(size, size).fx).abs() < 1e-9, "{i}: {found:?}");
     }
-    let wrong = Silhouette { camera: from[0], ..Silhouette::from(&views[1]) };
-    let refused = Targets::new(Evidence { views: &views[..1], silhouettes: vec![wrong] }, None).err().unwrap();
+    let wrong = PosedImage { camera: from[0], ..PosedImage::from(&views[1]) };
+    let refused = Targets::new(Evidence { silhouettes: vec![wrong], ..(&views[..1]).into() }, None).err().unwrap();
     assert!(matches!(refused, FitError::View { field: "image", .. }), "{refused}");
+}
+
+/// Parts of images are compared as if they had been cut out, and fits of all views but one share their images.
+#[test]
+fn parts_of_images_and_all_views_but_one_are_no_copies() {
+    let whole = ring(4, 60, &ball(12, 1));
+    let far: Vec<View> = whole
+        .iter()
+        .map(|view| {
+            let mut image = image::RgbaImage::new(90, 70);
+            image::imageops::replace(&mut image, &view.image, 20, 5);
+            let c = view.camera;
+            View {
+                image,
+                camera: Camera { width: 90, height: 70, cx: c.cx + 20.0, cy: c.cy + 5.0, ..c },
+                ..view.clone()
+            }
+        })
+        .collect();
+    let window = |view: &View| Window::around(view);
+    let cut: Vec<View> = far.iter().map(|view| window(view).cut(view).into_owned()).collect();
+    let part = |view| {
+        let (window, posed) = (window(view), PosedImage::from(view));
+        PosedImage { camera: window.camera(&posed.camera), window: Some(window), ..posed }
+    };
+    let parts: Vec<PosedImage<'_>> = far.iter().map(part).collect();
+    for size in [None, Some(32)] {
+        let (a, b) = (Targets::new(parts.clone(), size).unwrap(), Targets::new(&cut, size).unwrap());
+        assert_eq!((&a.images, &a.cameras), (&b.images, &b.cameras));
+        let others = a.without(1);
+        assert_eq!((others.views, &others.cameras[1]), (3, &a.cameras[2]));
+        assert!(std::sync::Arc::ptr_eq(&others.images[2], &a.images[3]));
+    }
+    let config = InitialFitConfig { iterations: 20, gaussians: 30, render_size: 32 };
+    let found = LeaveOneOut::new(&cut, &config).unwrap().fit(1, 5, go).unwrap();
+    let others = [cut[0].clone(), cut[2].clone(), cut[3].clone()];
+    assert_eq!(found.rows(), initial_fit(&others, &config, 5, go).unwrap().rows());
 }
 
 /// What searches for symmetries begin with.
@@ -226,7 +264,7 @@ fn continuing_keeps_the_number_and_comes_nearer() {
 
 /// A cloud as a generator might give it: right on the whole, wrong in detail.
 fn evidence<'a>(views: &'a [View], silhouettes: &'a [View]) -> Evidence<'a> {
-    Evidence { views, silhouettes: silhouettes.iter().map(Silhouette::from).collect() }
+    Evidence { silhouettes: silhouettes.iter().map(PosedImage::from).collect(), ..views.into() }
 }
 
 /// Silhouettes from further places mend the shape, and tell no colors.

@@ -1,42 +1,67 @@
 //! The views as a fit sees them: checked, shrunk, and put over a background.
 
+use std::{borrow::Cow, sync::Arc};
+
 use crate::FitError;
 use freerange_raster::RasterConfig;
-use freerange_scene::camera::{Camera, View, image_ops};
+use freerange_scene::camera::{Camera, View, Window, image_ops};
 use glam::{DMat3, DVec3};
 use image::{RgbaImage, imageops::crop_imm};
 use rand::Rng;
 use rayon::prelude::*;
 
-/// What a fit is to agree with. Views alone are one, too.
+/// What a fit is to agree with. Views alone are one, too. Images are only referred to: a fit makes its own, of its own size.
 #[derive(Clone, Debug)]
 pub struct Evidence<'a> {
     /// Posed views.
-    pub views: &'a [View],
-    /// Silhouettes from further places.
-    pub silhouettes: Vec<Silhouette<'a>>,
+    pub views: Vec<PosedImage<'a>>,
+    /// Silhouettes from further places: of these images the alpha alone counts.
+    pub silhouettes: Vec<PosedImage<'a>>,
 }
 
-/// What a picture tells of an object's shape, and of that alone: its alpha. Many may share one picture.
+/// An image, or a part of it, and the camera that took it. Many may share one image.
 #[derive(Clone, Copy, Debug)]
-pub struct Silhouette<'a> {
+pub struct PosedImage<'a> {
     /// Of the view that it comes from, for messages.
     pub name: &'a str,
-    /// From where it is seen.
+    /// From where it is seen; of the part alone where there is one.
     pub camera: Camera,
-    /// The picture.
+    /// The image.
     pub image: &'a RgbaImage,
+    /// The part of it that counts; none: all of it.
+    pub window: Option<Window>,
 }
 
-impl<'a> From<&'a View> for Silhouette<'a> {
+impl PosedImage<'_> {
+    fn size(&self) -> (u32, u32) {
+        self.window.map_or(self.image.dimensions(), |window| (window.side(), window.side()))
+    }
+
+    fn pixels(&self) -> Cow<'_, RgbaImage> {
+        self.window.map_or(Cow::Borrowed(self.image), |window| Cow::Owned(window.image(self.image)))
+    }
+
+    /// Whether it shows the same pixels as another one.
+    fn shares(&self, other: &Self) -> bool {
+        std::ptr::eq(self.image, other.image) && self.window == other.window
+    }
+}
+
+impl<'a> From<&'a View> for PosedImage<'a> {
     fn from(view: &'a View) -> Self {
-        Self { name: &view.name, camera: view.camera, image: &view.image }
+        Self { name: &view.name, camera: view.camera, image: &view.image, window: None }
+    }
+}
+
+impl<'a> From<Vec<PosedImage<'a>>> for Evidence<'a> {
+    fn from(views: Vec<PosedImage<'a>>) -> Self {
+        Self { views, silhouettes: Vec::new() }
     }
 }
 
 impl<'a> From<&'a [View]> for Evidence<'a> {
     fn from(views: &'a [View]) -> Self {
-        Self { views, silhouettes: Vec::new() }
+        views.iter().map(PosedImage::from).collect::<Vec<_>>().into()
     }
 }
 
@@ -58,19 +83,20 @@ const TRIES: usize = 64;
 /// Views, each of its own size, and after them those of which the silhouette alone counts.
 pub(crate) struct Targets {
     pub cameras: Vec<Camera>,
-    pub images: Vec<RgbaImage>,
+    /// One for all that share it.
+    pub images: Vec<Arc<RgbaImage>>,
     /// How many of them are more than silhouettes.
     pub views: usize,
     rasters: Vec<RasterConfig>,
 }
 
-fn refuse<T>(view: &Silhouette<'_>, field: &'static str, expected: String, found: String) -> Result<T, FitError> {
+fn refuse<T>(view: &PosedImage<'_>, field: &'static str, expected: String, found: String) -> Result<T, FitError> {
     Err(FitError::View { name: view.name.to_owned(), field, expected, found })
 }
 
-fn check(view: &Silhouette<'_>) -> Result<(), FitError> {
+fn check(view: &PosedImage<'_>) -> Result<(), FitError> {
     let c = &view.camera;
-    let (width, height) = view.image.dimensions();
+    let (width, height) = view.size();
     if (width, height) != (c.width, c.height) {
         let expected = format!("{} x {} pixels, the camera's size", c.width, c.height);
         return refuse(view, "image", expected, format!("{width} x {height}"));
@@ -100,27 +126,32 @@ impl Targets {
         if seen.views.is_empty() {
             return Err(FitError::NoViews);
         }
-        let all: Vec<Silhouette<'_>> = seen.views.iter().map(Silhouette::from).chain(seen.silhouettes).collect();
+        let views = seen.views.len();
+        let all: Vec<PosedImage<'_>> = seen.views.into_iter().chain(seen.silhouettes).collect();
         all.iter().try_for_each(check)?;
         // Each picture once, however many share it.
-        let mut pictures: Vec<&RgbaImage> = Vec::new();
+        let mut pictures: Vec<PosedImage<'_>> = Vec::new();
         let of: Vec<usize> = all
             .iter()
             .map(|one| {
-                pictures.iter().position(|known| std::ptr::eq(*known, one.image)).unwrap_or_else(|| {
-                    pictures.push(one.image);
+                pictures.iter().position(|known| known.shares(one)).unwrap_or_else(|| {
+                    pictures.push(*one);
                     pictures.len() - 1
                 })
             })
             .collect();
-        let small = |image: &RgbaImage| {
-            let full = image.dimensions();
+        let small = |one: PosedImage<'_>| {
+            let full = one.size();
             let (w, h) = size.map_or(full, |size| image_ops::shrunk_size(full, size));
             let longest = |(w, h): (u32, u32)| w.max(h) as f32;
             let raster = RasterConfig::default().shrunk(longest((w, h)) / longest(full));
-            (image_ops::resize_area(image, w, h), raster)
+            let image = match (w, h) == full {
+                true => one.pixels().into_owned(),
+                false => image_ops::resize_area(&one.pixels(), w, h),
+            };
+            (Arc::new(image), raster)
         };
-        let (pictures, rasters): (Vec<RgbaImage>, Vec<RasterConfig>) = pictures.into_par_iter().map(small).unzip();
+        let (pictures, rasters): (Vec<Arc<RgbaImage>>, Vec<RasterConfig>) = pictures.into_par_iter().map(small).unzip();
         let cameras = all.iter().zip(&of).map(|(one, &of)| {
             let (w, h) = pictures[of].dimensions();
             one.camera.resized(w, h)
@@ -128,9 +159,20 @@ impl Targets {
         Ok(Self {
             cameras: cameras.collect(),
             images: of.iter().map(|&of| pictures[of].clone()).collect(),
-            views: seen.views.len(),
+            views,
             rasters: of.iter().map(|&of| rasters[of]).collect(),
         })
+    }
+
+    /// All views but one, and no silhouettes. Images are shared.
+    pub fn without(&self, left_out: usize) -> Self {
+        let kept: Vec<usize> = (0..self.views).filter(|i| *i != left_out).collect();
+        Self {
+            cameras: kept.iter().map(|&i| self.cameras[i]).collect(),
+            images: kept.iter().map(|&i| self.images[i].clone()).collect(),
+            views: kept.len(),
+            rasters: kept.iter().map(|&i| self.rasters[i]).collect(),
+        }
     }
 
     /// The views `chosen`, in groups that can be rendered together (one size, one blur), and how to render these.
@@ -143,7 +185,7 @@ impl Targets {
     pub fn windows(&self, chosen: &[usize], part: f64, rng: &mut impl Rng) -> Self {
         let mut windows = Self { cameras: Vec::new(), images: Vec::new(), views: chosen.len(), rasters: Vec::new() };
         for &i in chosen {
-            let image = &self.images[i];
+            let image = &*self.images[i];
             let (width, height) = image.dimensions();
             let [w, h] = [width, height].map(|side| ((f64::from(side) * part).round() as u32).clamp(1, side));
             // Where nothing of the object is found, the middle.
@@ -156,7 +198,7 @@ impl Targets {
             let camera = self.cameras[i];
             let (cx, cy) = (camera.cx - f64::from(x), camera.cy - f64::from(y));
             windows.cameras.push(Camera { width: w, height: h, cx, cy, ..camera });
-            windows.images.push(crop_imm(image, x, y, w, h).to_image());
+            windows.images.push(Arc::new(crop_imm(image, x, y, w, h).to_image()));
             windows.rasters.push(self.rasters[i]);
         }
         windows

@@ -8,7 +8,7 @@ use std::{
 
 use freerange_scene::camera::{CameraError, FrameConfig, Similarity, Up, View, canonical_from_user};
 use freerange_scene::{
-    LoadConfig, MaskSource, SceneConfig, SceneError,
+    KeepWhole, LoadConfig, MaskSource, SceneConfig, SceneError,
     estimate::Hints,
     inspect::{inspect, sheet},
     read::{Format, ReadConfig, Turntable, cameras_with},
@@ -210,7 +210,7 @@ impl Preparation<'_> {
             max_side: self.limits.side,
             hints: Hints { others: self.engine.leave_one_out(), ..Hints::default() },
             memory: self.limits.memory,
-            whole_folder: Some(self.folder.to_path_buf()),
+            whole: KeepWhole::Folder(self.folder.to_path_buf()),
             stop: self.stop.clone(),
         };
         let config = SceneConfig { cameras, photos, up: options.up()? };

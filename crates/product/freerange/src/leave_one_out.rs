@@ -3,41 +3,47 @@
 use std::ops::ControlFlow;
 
 use freerange_gaussians::Gaussians;
-use freerange_optim::{FitProgress, InitialFitConfig, initial_fit};
+use freerange_optim::{FitProgress, InitialFitConfig, LeaveOneOut, PosedImage};
 use freerange_raster::RasterConfig;
-use freerange_scene::camera::{Camera, FrameConfig, View, Window};
+use freerange_scene::camera::{Camera, FrameConfig, View, Window, canonical_from_user};
 use freerange_util::Stop;
 use image::{Rgba, RgbaImage};
 use rayon::prelude::*;
 
-use crate::{Error, error::Lift, to_canonical};
+use crate::{Error, error::Lift};
 
 /// Shows each view as a quick fit of all the others has it: straight color and alpha, at its image's size, in the order of `views`, whose
 /// alpha is the object's mask. What one mask lacks by mistake others have, and the other way round. (`freerange_scene::estimate::LeaveOneOut`.)
 ///
 /// # Errors
 /// A sentence, where the views do not show one object from different places, or a fit diverges.
-pub fn leave_one_out(views: &[View], stop: &Stop) -> Result<Vec<RgbaImage>, String> {
+pub fn leave_one_out(views: Vec<View>, stop: &Stop) -> Result<Vec<RgbaImage>, String> {
     shown(views, stop).map_err(|e| e.to_string())
 }
 
-fn shown(views: &[View], stop: &Stop) -> Result<Vec<RgbaImage>, Error> {
+fn shown(views: Vec<View>, stop: &Stop) -> Result<Vec<RgbaImage>, Error> {
     // Finer or longer fits mend no more (docs/research/experiments/masks.md).
     let config = InitialFitConfig { iterations: 150, gaussians: 2048, render_size: 128 };
-    let (_, canonical) = to_canonical(views, &FrameConfig::default())?;
-    let framed = |v: &View| Window::framed(v).map_or_else(|| v.clone(), |w| w.cut(v).into_owned());
-    let framed: Vec<View> = canonical.iter().map(framed).collect();
-    (0..views.len())
+    let place = canonical_from_user(&views, &FrameConfig::default()).lift()?.canonical_from_user;
+    let cameras: Vec<Camera> = views.iter().map(|v| v.camera.transformed(&place)).collect();
+    let framed = |(view, camera): (&View, &Camera)| {
+        let window = Window::framed_in(camera, &view.image);
+        let camera = window.map_or(*camera, |window| window.camera(camera));
+        (window, camera)
+    };
+    let frames: Vec<(Option<Window>, Camera)> = views.iter().zip(&cameras).map(framed).collect();
+    let posed = views.iter().zip(frames).map(|(view, (window, camera))| PosedImage { window, camera, ..view.into() });
+    let fits = LeaveOneOut::new(posed.collect::<Vec<_>>(), &config).lift()?;
+    // The fits have what they need of the views.
+    drop(views);
+    (0..cameras.len())
         .into_par_iter()
         .map(|i| {
-            let others: Vec<View> =
-                framed.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, v)| v.clone()).collect();
             let go_on = |_: &FitProgress<'_>| match stop.check() {
                 Ok(()) => ControlFlow::Continue(()),
                 Err(_) => ControlFlow::Break(()),
             };
-            let cloud = initial_fit(&others, &config, i as u64, go_on).lift()?;
-            picture(&cloud, &canonical[i].camera)
+            picture(&fits.fit(i, i as u64, go_on).lift()?, &cameras[i])
         })
         .collect()
 }

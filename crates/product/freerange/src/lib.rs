@@ -77,7 +77,7 @@ pub use freerange_model::Compute;
 pub use freerange_optim::InitialFitConfig;
 pub use freerange_scene::camera::{Camera, CanonicalFrame, FrameConfig, Similarity, Up, View};
 pub use freerange_scene::{
-    LoadConfig, Loaded, MaskSource, SceneConfig,
+    KeepWhole, LoadConfig, Loaded, MaskSource, SceneConfig,
     estimate::Hints,
     read::{Cameras, Format as CameraFormat, ReadConfig, Turntable},
 };

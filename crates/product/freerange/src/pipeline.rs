@@ -92,7 +92,7 @@ impl Reconstructor {
     /// Reconstructs an object from two or more views: see the [module](self).
     ///
     /// `progress` hears of every step and ends the work by `ControlFlow::Break`. Memory grows with the pixels of the views
-    /// and with the number of proposals, not with that of seeds.
+    /// at the sizes that are compared, without another copy of them, and with the number of proposals, not with that of seeds.
     ///
     /// # Errors
     /// [`Error::Cancelled`] where `progress` says so; views or options that cannot be used; a device that fails.

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use freerange_scene::camera::{FrameConfig, View};
+use freerange_scene::camera::{FrameConfig, View, canonical_from_user};
 use freerange_scene::{
     Loaded, SceneConfig, cut,
     estimate::Hints,
@@ -11,7 +11,7 @@ use freerange_scene::{
 };
 use freerange_util::Note;
 
-use crate::{Error, choose_views, error::Lift, leave_one_out::leave_one_out, to_canonical};
+use crate::{Error, choose_views, error::Lift, leave_one_out::leave_one_out};
 
 /// Photos with cameras, read and cut out.
 #[derive(Clone, Debug)]
@@ -71,7 +71,7 @@ impl Scene {
     /// # Errors
     /// If the views do not show one object from different places.
     pub fn warnings(&self, network_views: usize) -> Result<Vec<Note>, Error> {
-        let (frame, _) = to_canonical(self.views(), &self.frame)?;
+        let frame = canonical_from_user(self.views(), &self.frame).lift()?;
         let shown = choose_views(self.views(), network_views)?;
         Ok(view_warnings(&self.loaded, &frame, &shown).into_iter().map(Note::warning).collect())
     }

@@ -213,7 +213,7 @@ impl Judgement {
     }
 
     fn predict(&mut self, loaded: &Loaded, bounds: &Bounds) {
-        let shown = match leave_one_out(&loaded.views, &bounds.stop) {
+        let shown = match leave_one_out(loaded.views.clone(), &bounds.stop) {
             Ok(shown) => shown,
             Err(e) => {
                 self.refused.push(format!("these poses give no render of the object ({e})"));

@@ -7,7 +7,7 @@ use std::{
     time::{Instant, UNIX_EPOCH},
 };
 
-use freerange::{Reconstructor, SETTINGS_SCHEMA, Scores};
+use freerange::{KeepWhole, Reconstructor, SETTINGS_SCHEMA, Scores};
 use freerange_train::ranks::gather;
 use freerange_util::write_atomically;
 use serde::{Deserialize, Serialize};
@@ -322,7 +322,7 @@ fn one(
         eprintln!("{}: files have changed since it was made: it is made again", entry.name);
     }
     let folder = args.output.join(&entry.name);
-    let scene = args.photos.load(cameras, args.pipeline.up)?;
+    let scene = args.photos.load(cameras, args.pipeline.up, KeepWhole::Small)?;
     let (report, _) =
         super::reconstruct(args, &entry.scene, scene, model, program, &folder, begin, || forget(&folder))?;
     let row = row(entry, &report, begin.elapsed().as_secs_f64());

@@ -43,7 +43,11 @@ impl Window {
     /// object. For a view in the canonical frame that is not square, or shows the sphere small; none for others, and where
     /// such a square is not within the image.
     pub fn framed(view: &View) -> Option<Self> {
-        let c = &view.camera;
+        Self::framed_in(&view.camera, &view.image)
+    }
+
+    /// [`framed`](Self::framed) for an image whose camera is moved to the canonical frame, without a copy of it.
+    pub fn framed_in(c: &Camera, image: &RgbaImage) -> Option<Self> {
         let short = i64::from(c.width.min(c.height));
         let middle = c.world_to_camera.transform_point3(DVec3::ZERO);
         // Phrased so that NaN fails it.
@@ -64,7 +68,7 @@ impl Window {
         };
         let (mut x, mut y) = (along(c.fx, c.cx, middle.x, c.width), along(c.fy, c.cy, middle.y, c.height));
         // Faint edges are the object's, too.
-        if let Some((seen_x, seen_y)) = extents(&view.image, 1) {
+        if let Some((seen_x, seen_y)) = extents(image, 1) {
             let both = |a: (i64, i64), b: Extent| (a.0.min(b.0.into()), a.1.max(b.1.into()));
             (x, y) = (both(x, seen_x), both(y, seen_y));
         }
@@ -100,18 +104,26 @@ impl Window {
         if view.image.dimensions() == (self.side, self.side) && (self.left, self.top) == (0, 0) {
             return Cow::Borrowed(view);
         }
-        let mut image = RgbaImage::new(self.side, self.side);
-        // Copies what both have; whatever the image lacks stays transparent.
-        image::imageops::replace(&mut image, &view.image, -self.left, -self.top);
-        let c = view.camera;
-        let camera = Camera {
-            width: self.side,
-            height: self.side,
-            cx: c.cx - self.left as f64,
-            cy: c.cy - self.top as f64,
-            ..c
-        };
+        let (camera, image) = (self.camera(&view.camera), self.image(&view.image));
         Cow::Owned(View { name: view.name.clone(), camera, image })
+    }
+
+    /// What it shows of an image.
+    pub fn image(self, image: &RgbaImage) -> RgbaImage {
+        let mut out = RgbaImage::new(self.side, self.side);
+        // Copies what both have; whatever the image lacks stays transparent.
+        image::imageops::replace(&mut out, image, -self.left, -self.top);
+        out
+    }
+
+    /// The camera of what it shows of this one's image.
+    pub fn camera(self, c: &Camera) -> Camera {
+        Camera { width: self.side, height: self.side, cx: c.cx - self.left as f64, cy: c.cy - self.top as f64, ..*c }
+    }
+
+    /// Its width and height in pixels.
+    pub fn side(self) -> u32 {
+        self.side
     }
 }
 

@@ -23,7 +23,7 @@ pub fn confirmed(views: &[View], hints: &Hints) -> Option<Vec<Option<Vec<u8>>>> 
     if views.len() < 3 {
         return None;
     }
-    let pictures: Vec<Picture> = views.par_iter().map(|v| Picture::of(v, SMALL)).collect();
+    let pictures: Vec<Picture> = views.par_iter().map(|v| Picture::outlined(v, SMALL)).collect();
     let masks: Vec<Vec<bool>> = pictures.iter().map(|p| p.valid.clone()).collect();
     let center = hints.center.or_else(|| meeting_point(views))?;
     let radius = expected_radius(&pictures, center, hints)?;

@@ -120,11 +120,14 @@ pub fn gather(
     };
     let outlines = |shift: usize| {
         let given: Vec<Vec<bool>> = (0..count)
+            .into_par_iter()
             .map(|i| moved(&pictures[i], &pictures[(i + shift) % count], &masks[(i + shift) % count]))
             .collect();
-        Some(mean(&outside(pictures, &given, center, radius)))
+        mean(&outside(pictures, &given, center, radius))
     };
-    Evidence { surface: compared(&on_surface), table: compared(&on_table), outline: compared(&outlines) }
+    // One after the other: each holds masks of all views.
+    let outline = Compared::of(Some(outlines(0)), rounds.iter().map(|shift| outlines(*shift)).collect());
+    Evidence { surface: compared(&on_surface), table: compared(&on_table), outline }
 }
 
 fn mean(values: &[f64]) -> f64 {
@@ -134,13 +137,17 @@ fn mean(values: &[f64]) -> f64 {
 /// For each view: the share of its mask that the hull of the other masks does not cover.
 pub fn outside(pictures: &[Picture], masks: &[Vec<bool>], center: DVec3, radius: f64) -> Vec<f64> {
     let nearly = Nearly::carve(pictures, masks, center, radius, GRID);
-    (0..pictures.len()).map(|i| left_out(&masks[i], &nearly.without(&[i]).outline(&pictures[i]))).collect()
+    let one = |i: usize| left_out(&masks[i], &nearly.without(i).outline(&pictures[i]));
+    (0..pictures.len()).into_par_iter().map(one).collect()
 }
 
 /// The share of a mask that an outline does not cover.
 fn left_out(mask: &[bool], outline: &[bool]) -> f64 {
-    let size = mask.iter().filter(|m| **m).count().max(1) as f64;
-    mask.iter().zip(outline).filter(|(m, o)| **m && !**o).count() as f64 / size
+    mask.iter().zip(outline).filter(|(m, o)| **m && !**o).count() as f64 / area(mask)
+}
+
+fn area(mask: &[bool]) -> f64 {
+    mask.iter().filter(|m| **m).count().max(1) as f64
 }
 
 /// For each view, how far its mask and those of the others contradict each other, 0 to 1: the share of it that the hull of the others
@@ -148,12 +155,33 @@ fn left_out(mask: &[bool], outline: &[bool]) -> f64 {
 pub fn contradictions(pictures: &[Picture], masks: &[Vec<bool>], center: DVec3, radius: f64) -> Vec<f64> {
     let count = pictures.len();
     let nearly = Nearly::carve(pictures, masks, center, radius, GRID);
-    let share = |of: usize, without: &[usize]| left_out(&masks[of], &nearly.without(without).outline(&pictures[of]));
-    let own: Vec<f64> = (0..count).into_par_iter().map(|i| share(i, &[i])).collect();
+    let (alone, both) = nearly.excluded(count);
+    let sizes: Vec<f64> = masks.iter().map(|mask| area(mask)).collect();
+    // Of each mask the pixels that the hull of the others leaves out.
+    let left: Vec<Vec<usize>> = (0..count)
+        .into_par_iter()
+        .map(|i| {
+            let outline = nearly.without(i).outline(&pictures[i]);
+            (0..outline.len()).filter(|k| masks[i][*k] && !outline[*k]).collect()
+        })
+        .collect();
+    let none = Vec::new();
+    // How many of them are left where `without` excludes nothing either: few points more, and most views exclude none alone.
+    let still = |of: usize, without: usize| {
+        let pair = [of.min(without), of.max(without)];
+        let more = [&alone[without], both.get(&pair).unwrap_or(&none)];
+        if left[of].is_empty() || more.iter().all(|points| points.is_empty()) {
+            return left[of].len();
+        }
+        let outline = nearly.hull(more.into_iter().flatten().copied().collect()).outline(&pictures[of]);
+        left[of].iter().filter(|k| !outline[**k]).count()
+    };
+    let share = |of: usize, pixels: usize| pixels as f64 / sizes[of];
+    let own: Vec<f64> = (0..count).map(|i| share(i, left[i].len())).collect();
     (0..count)
         .into_par_iter()
         .map(|i| {
-            let spared: f64 = (0..count).filter(|j| *j != i).map(|j| own[j] - share(j, &[i, j])).sum();
+            let spared: f64 = (0..count).filter(|j| *j != i).map(|j| own[j] - share(j, still(j, i))).sum();
             own[i].max(spared / (count - 1).max(1) as f64)
         })
         .collect()

@@ -3,6 +3,7 @@
 use super::picture::Picture;
 use glam::DVec3;
 use rayon::prelude::*;
+use std::collections::HashMap;
 
 /// Voxels along the longest side in the first of two passes.
 const COARSE: usize = 56;
@@ -104,10 +105,27 @@ impl Nearly {
         Self { points, step }
     }
 
-    /// The hull of all masks but these: what no other view excludes.
-    pub fn without(&self, left_out: &[usize]) -> Hull {
-        let own = |without: &[Option<usize>; 2]| without.iter().flatten().all(|i| left_out.contains(i));
-        let points = self.points.iter().filter(|(_, without)| own(without)).map(|(p, _)| *p).collect();
+    /// The hull of all masks but one: what no other view excludes.
+    pub fn without(&self, left_out: usize) -> Hull {
+        let own = |without: &[Option<usize>; 2]| without.iter().flatten().all(|i| *i == left_out);
+        self.hull(self.points.iter().filter(|(_, without)| own(without)).map(|(p, _)| *p).collect())
+    }
+
+    /// The points that one of `count` views excludes, by its number, and those that two do, by theirs in order.
+    pub fn excluded(&self, count: usize) -> (Vec<Vec<DVec3>>, HashMap<[usize; 2], Vec<DVec3>>) {
+        let (mut one, mut two) = (vec![Vec::new(); count], HashMap::<_, Vec<DVec3>>::new());
+        for (point, without) in &self.points {
+            match *without {
+                [Some(i), Some(j)] => two.entry([i, j]).or_default().push(*point),
+                [Some(i), None] => one[i].push(*point),
+                _ => {}
+            }
+        }
+        (one, two)
+    }
+
+    /// Some of the points as a hull.
+    pub fn hull(&self, points: Vec<DVec3>) -> Hull {
         Hull { points, step: self.step }
     }
 }

@@ -1,7 +1,7 @@
 //! Mixtures of Gaussians over colors, fitted by expectation and maximization.
 
 use glam::{Mat3, Vec3};
-use rand::{Rng, SeedableRng, seq::IndexedRandom};
+use rand::{Rng, SeedableRng, seq::index};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
@@ -24,12 +24,18 @@ pub struct Mixture(Vec<Component>);
 impl Mixture {
     /// Fits `count` components to the colors; none for no colors. The same colors and seed give the same mixture.
     pub fn fit(colors: &[Vec3], count: usize, seed: u64) -> Option<Self> {
+        Self::fit_some(colors.len(), |which| which.iter().map(|&i| colors[i]).collect(), count, seed)
+    }
+
+    /// The same without all colors at hand: of `all`, `colors` gives those of some numbers.
+    pub fn fit_some(all: usize, colors: impl FnOnce(&[usize]) -> Vec<Vec3>, count: usize, seed: u64) -> Option<Self> {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let samples: Vec<Vec3> = match colors.len() {
+        let which: Vec<usize> = match all {
             0 => return None,
-            n if n <= SAMPLES => colors.to_vec(),
-            _ => colors.choose_multiple(&mut rng, SAMPLES).copied().collect(),
+            n if n <= SAMPLES => (0..n).collect(),
+            n => index::sample(&mut rng, n, SAMPLES).into_vec(),
         };
+        let samples = colors(&which);
         let mut centers = vec![samples[rng.random_range(0..samples.len())]];
         let mut nearest = vec![f32::INFINITY; samples.len()];
         while centers.len() < count {

@@ -8,6 +8,7 @@
 //! print in the table's color, a foot in its own shadow, the opening of a handle. Work is done on small pictures, and only the outline is
 //! cut again on larger ones.
 
+mod colors;
 mod confirm;
 mod evidence;
 mod hull;
@@ -31,7 +32,7 @@ pub(crate) use sharpen::memory;
 use crate::SceneError;
 use crate::camera::View;
 use freerange_util::Stop;
-use glam::{DVec3, Vec3};
+use glam::DVec3;
 use hull::{Floor, Hull, reaches_border};
 use image::RgbaImage;
 use leave_one_out::{LEAST_VIEWS, ROUNDS};
@@ -42,11 +43,14 @@ use picture::Picture;
 use place::{expected_radius, mean_up, meeting_point, nearness};
 use plane::{Plane, Table};
 use rayon::prelude::*;
-use shown::Shown;
+use shown::Kept;
+use std::borrow::Cow;
 
 /// Longer side of the pictures that take turns, and of those that the outline is cut on.
-const SMALL: u32 = 320;
+pub(crate) const SMALL: u32 = 320;
 const LARGE: u32 = 640;
+/// What can be made again of a view is kept of up to so many; 300 photos would take gigabytes.
+const KEPT: usize = 32;
 /// Turns, at most.
 const TURNS: usize = 10;
 /// Turns end when masks change by less than this share.
@@ -59,15 +63,9 @@ const INSIDE: f32 = 1.0;
 /// is. Less, and the foot of what has one color is taken for a print on the table, on which all views agree.
 const UNSEEN: f32 = 0.7;
 const SEEN: f32 = 0.95;
-/// Before there are masks, colors that are certainly the object's stand for all of it if they are this share of what lies about where the
-/// cameras look. A handle that stands out is less: what it belongs to may lie flat on the table.
-const SURE: f64 = 0.02;
 /// Voxels along the hull's longest side: while masks change, and to judge them.
 const ROUGH: usize = 56;
 const FINE: usize = 120;
-/// Components of the mixtures.
-const OBJECT: usize = 5;
-const BACKGROUND: usize = 8;
 
 /// What is known beforehand.
 #[derive(Clone, Copy, Debug, Default)]
@@ -83,7 +81,7 @@ pub struct Hints {
 /// Masks that were found, and how far to rely on them.
 #[derive(Clone, Debug)]
 pub struct Estimate {
-    /// The object's share of each pixel, for every view at its image's own size, `[h, w]`.
+    /// The object's share of each pixel, for every view at its image's own size, `[h, w]`. None once they are the views' alpha.
     pub alpha: Vec<Vec<u8>>,
     /// For every view: how far its mask agrees with the hull of all masks (intersection over union).
     pub agreement: Vec<f64>,
@@ -131,7 +129,7 @@ pub fn masks(views: &[View], hints: &Hints) -> Result<Estimate, SceneError> {
 
 /// [`masks`], unless it is stopped.
 pub(crate) fn masks_until(views: &[View], hints: &Hints, stop: &Stop) -> Result<Estimate, SceneError> {
-    let found = search(views, hints, stop)?;
+    let found = search(views, hints, stop, KEPT)?;
     match found.contradiction(views) {
         Some(reason) => Err(SceneError::NotCutOut { reason }),
         None => Ok(found),
@@ -141,15 +139,21 @@ pub(crate) fn masks_until(views: &[View], hints: &Hints, stop: &Stop) -> Result<
 /// [`masks`] also where the views contradict each other. For tests.
 #[doc(hidden)]
 pub fn unjudged(views: &[View], hints: &Hints) -> Result<Estimate, SceneError> {
-    search(views, hints, &Stop::default())
+    search(views, hints, &Stop::default(), KEPT)
 }
 
-fn search(views: &[View], hints: &Hints, stop: &Stop) -> Result<Estimate, SceneError> {
+/// [`unjudged`] for views of which no more than `kept` are kept whole. For tests.
+#[doc(hidden)]
+pub fn unjudged_keeping(kept: usize, views: &[View], hints: &Hints) -> Result<Estimate, SceneError> {
+    search(views, hints, &Stop::default(), kept)
+}
+
+fn search(views: &[View], hints: &Hints, stop: &Stop, kept: usize) -> Result<Estimate, SceneError> {
     let refuse = |reason: String| Err(SceneError::NotCutOut { reason });
     if views.len() < 3 {
         return refuse(format!("expected at least 3 views, found {}", views.len()));
     }
-    let stage = Stage::new(views, hints, stop)?;
+    let mut stage = Stage::new(views, hints, stop, kept)?;
     let mut notes = Vec::new();
     match &stage.plane {
         Some(plane) => notes.push(format!(
@@ -161,11 +165,12 @@ fn search(views: &[View], hints: &Hints, stop: &Stop) -> Result<Estimate, SceneE
     let mut small = stage.take_turns()?;
     // Poses are judged by what photos say themselves.
     let evidence = stage.evidence(&small);
+    stage.forget();
     if let Some(others) = hints.others.filter(|_| views.len() >= LEAST_VIEWS) {
         for _ in 0..ROUNDS {
             stop.check()?;
-            match stage.shown_by_others(views, &small, others) {
-                Ok(shown) => small = stage.refine(&small, shown)?,
+            match stage.shown_by_others(&small, others) {
+                Ok(shown) => small = stage.refine(small, shown)?,
                 Err(reason) => {
                     stop.check()?;
                     notes.push(format!("masks are not corrected by the other views: {reason}"));
@@ -174,7 +179,9 @@ fn search(views: &[View], hints: &Hints, stop: &Stop) -> Result<Estimate, SceneE
             }
         }
     }
-    let large = stage.sharpen(views, &small)?;
+    let large = stage.sharpen(&small)?;
+    let clearness = std::mem::take(&mut small.clearness);
+    drop(small);
     stop.check()?;
     let hull = Hull::carve(&large.pictures, &large.masks, stage.center, 1.3 * stage.radius, stage.floor(), 0, FINE);
     let agreement: Vec<f64> = match &hull {
@@ -193,12 +200,18 @@ fn search(views: &[View], hints: &Hints, stop: &Stop) -> Result<Estimate, SceneE
         .map(|(view, (picture, mask))| soft(mask, picture, view.image.dimensions()))
         .collect();
     let up = stage.plane.as_ref().map(|p| p.normal);
-    Ok(Estimate { alpha, agreement, clearness: small.clearness, up, evidence, notes })
+    Ok(Estimate { alpha, agreement, clearness, up, evidence, notes })
 }
 
 /// The scene as far as it does not change while masks are looked for.
-struct Stage {
+struct Stage<'a> {
+    views: &'a [View],
+    /// Of how many views everything is kept.
+    kept: usize,
+    /// Small ones: whole, or of more views than are kept what others are compared with.
     pictures: Vec<Picture>,
+    /// See [`Self::nearness`]; none of more views than are kept.
+    near: Vec<Vec<f32>>,
     /// Where the cameras look, and the sphere about it that the object is expected in.
     center: DVec3,
     radius: f64,
@@ -219,13 +232,18 @@ struct Masks {
     background: Mixture,
     /// The hull's outlines, `[h, w]`.
     outlines: Vec<Vec<bool>>,
-    /// What the other views show of each, as it is wanted for small and for large pictures; empty before masks are refined.
-    shown: Vec<[Shown; 2]>,
+    /// What the other views show of each; empty before masks are refined.
+    shown: Vec<Kept>,
 }
 
-impl Stage {
-    fn new(views: &[View], hints: &Hints, stop: &Stop) -> Result<Self, SceneError> {
-        let pictures: Vec<Picture> = views.par_iter().map(|v| Picture::of(v, SMALL)).collect();
+impl<'a> Stage<'a> {
+    fn new(views: &'a [View], hints: &Hints, stop: &Stop, kept: usize) -> Result<Self, SceneError> {
+        let all = views.len() <= kept;
+        let picture = |view: &View| match Picture::of(view, SMALL) {
+            picture if all => picture,
+            picture => picture.into_comparable(),
+        };
+        let pictures: Vec<Picture> = views.par_iter().map(picture).collect();
         let Some(center) = hints.center.or_else(|| meeting_point(views)) else {
             let reason = "the cameras do not look at one common point; if the poses are right, say where the object is (--center X,Y,Z)";
             return Err(SceneError::NotCutOut { reason: reason.into() });
@@ -236,14 +254,33 @@ impl Stage {
                 "the point that the cameras look at is not in the photos; say where the object is (--center X,Y,Z)";
             return Err(SceneError::NotCutOut { reason: reason.into() });
         };
-        let mut stage = Self { pictures, center, radius, distance, plane: None, best: None, stop: stop.clone() };
+        let near = pictures.iter().filter(|_| all).map(|p| nearness(p, center, radius)).collect();
+        let (plane, best, stop) = (None, None, stop.clone());
+        let mut stage = Self { views, kept, pictures, near, center, radius, distance, plane, best, stop };
         let object: Vec<Vec<bool>> =
             (0..views.len()).map(|i| stage.nearness(i).iter().map(|d| *d < 0.6).collect()).collect();
-        let found = plane::find(&stage.pictures, &object, center, mean_up(views), distance, stop);
-        stop.check()?;
+        let found = plane::find(&stage.pictures, &object, center, mean_up(views), distance, &stage.stop);
+        stage.stop.check()?;
         stage.plane = found.filter(|(_, stands_out)| *stands_out).map(|(plane, _)| plane);
         stage.best = found.map(|(plane, _)| plane);
         Ok(stage)
+    }
+
+    /// The whole small picture of view `i`.
+    fn picture(&self, i: usize) -> Cow<'_, Picture> {
+        match self.views.len() <= self.kept {
+            true => Cow::Borrowed(&self.pictures[i]),
+            false => Cow::Owned(Picture::of(&self.views[i], SMALL)),
+        }
+    }
+
+    /// Once poses are judged, only views that are asked are compared with: of many, what the others look like is forgotten.
+    fn forget(&mut self) {
+        if self.views.len() > self.kept {
+            let asked = plane::asked(self.views.len());
+            let others = self.pictures.iter_mut().zip(asked).filter(|(_, asked)| !asked);
+            others.for_each(|(picture, _)| picture.smooth = Vec::new());
+        }
     }
 
     fn evidence(&self, found: &Masks) -> Evidence {
@@ -259,19 +296,22 @@ impl Stage {
     }
 
     /// How far each pixel's ray passes by the center, in radii: `[h, w]`.
-    fn nearness(&self, i: usize) -> Vec<f32> {
-        nearness(&self.pictures[i], self.center, self.radius)
+    fn nearness(&self, i: usize) -> Cow<'_, [f32]> {
+        match self.near.get(i) {
+            Some(near) => Cow::Borrowed(near.as_slice()),
+            None => Cow::Owned(nearness(&self.pictures[i], self.center, self.radius)),
+        }
     }
 
-    fn table(&self, background: &[Vec<f32>], i: usize) -> Option<Table> {
-        let plane = self.plane.as_ref()?;
-        Some(plane::table(&self.pictures, background, i, self.center, plane, self.distance, |_| true))
-    }
-
+    /// The tables of all views. `background`: see [`Self::background`].
     fn tables(&self, background: &[Vec<f32>]) -> Result<Vec<Option<Table>>, SceneError> {
-        let one = |i| {
+        let one = |i: usize| {
             self.stop.check()?;
-            Ok(self.table(background, i))
+            let Some(plane) = &self.plane else { return Ok(None) };
+            let (picture, near, distance) = (self.picture(i), self.nearness(i), self.distance);
+            let about = |k: usize| picture.valid[k] && near[k] < 1.0;
+            let pictures = &self.pictures;
+            Ok(Some(plane::table(pictures, background, i, &picture, self.center, plane, distance, |_| true, about)))
         };
         (0..self.pictures.len()).map(one).collect()
     }
@@ -279,31 +319,34 @@ impl Stage {
     /// Cuts all views in turns until their masks stay as they are.
     fn take_turns(&self) -> Result<Masks, SceneError> {
         let count = self.pictures.len();
-        let near: Vec<Vec<f32>> = (0..count).map(|i| self.nearness(i)).collect();
-        let mut background: Vec<Vec<f32>> =
-            near.iter().map(|n| n.iter().map(|d| ((d - UNSEEN) / (SEEN - UNSEEN)).clamp(0.0, 1.0)).collect()).collect();
+        let unseen =
+            |i: usize| self.nearness(i).iter().map(|d| ((d - UNSEEN) / (SEEN - UNSEEN)).clamp(0.0, 1.0)).collect();
+        let mut background: Vec<Vec<f32>> = self.of_asked(unseen);
         let mut last: Option<Masks> = None;
         for _ in 0..TURNS {
             let tables = self.tables(&background)?;
-            let (object, behind) = self.colors(&near, &tables, last.as_ref())?;
+            let (object, behind) = self.colors(&tables, last.as_ref())?;
             let cut: Vec<(Vec<bool>, f64)> = (0..count)
                 .into_par_iter()
                 .map(|i| {
                     self.stop.check()?;
-                    let odds = odds(&self.pictures[i], &object, &behind, tables[i].as_ref(), None, |_| true);
+                    let (picture, near) = (self.picture(i), self.nearness(i));
+                    let odds = odds(&picture, &object, &behind, tables[i].as_ref(), None, |_| true);
                     let biased = |k: usize| match &last {
                         Some(last) if last.outlines[i][k] => odds[k] + INSIDE,
                         Some(_) => odds[k] - OUTSIDE,
                         None => odds[k],
                     };
-                    let mask = self.cut(i, &near[i], &odds, last.as_ref().map(|l| &l.outlines[i][..]), biased);
-                    let about = (0..mask.len()).filter(|k| near[i][*k] < 1.0);
+                    let outline = last.as_ref().map(|l| &l.outlines[i][..]);
+                    let mask = cut_small(&picture, &near, &odds, outline, biased);
+                    let about = (0..mask.len()).filter(|k| near[*k] < 1.0);
                     let (right, all) = about.fold((0usize, 0usize), |(right, all), k| {
                         (right + usize::from(mask[k] == (odds[k] > 0.0)), all + 1)
                     });
                     Ok((mask, right as f64 / all.max(1) as f64))
                 })
                 .collect::<Result<_, SceneError>>()?;
+            drop(tables);
             let (masks, clearness): (Vec<Vec<bool>>, Vec<f64>) = cut.into_iter().unzip();
             let outlines = self.outlines(&masks).ok_or_else(|| SceneError::NotCutOut {
                 reason:
@@ -322,21 +365,6 @@ impl Stage {
         last.ok_or_else(|| SceneError::NotCutOut { reason: "no turns".into() })
     }
 
-    /// The small picture `i` cut at these log odds, tidied by what colors alone and the hull's outline say.
-    fn cut(
-        &self,
-        i: usize,
-        near: &[f32],
-        odds: &[f32],
-        outline: Option<&[bool]>,
-        biased: impl Fn(usize) -> f32,
-    ) -> Vec<bool> {
-        let picture = &self.pictures[i];
-        let beyond = |k: usize| near[k] > 1.3 || !picture.valid[k];
-        let biased: Vec<f32> = (0..odds.len()).map(|k| if beyond(k) { -50.0 } else { biased(k) }).collect();
-        tidy(&cut(picture, &biased, None), odds, outline, picture)
-    }
-
     /// Where the hull of small masks appears in each picture, and a little around it.
     fn outlines(&self, masks: &[Vec<bool>]) -> Option<Vec<Vec<bool>>> {
         let missing = usize::from(masks.len() >= 6);
@@ -344,69 +372,37 @@ impl Stage {
         Some(self.pictures.par_iter().map(|p| grown(&hull.outline(p), p.width(), p.height(), 2)).collect())
     }
 
-    /// How likely each pixel of each small picture is not the object.
+    /// How likely each pixel of small pictures is not the object, of those that others ask.
     fn background(&self, masks: &[Vec<bool>]) -> Vec<Vec<f32>> {
-        let of = |(m, p): (&Vec<bool>, &Picture)| {
-            smooth(m, p.width(), p.height()).iter().map(|v| (1.0 - v).clamp(0.03, 1.0)).collect()
-        };
-        masks.iter().zip(&self.pictures).map(of).collect()
+        self.of_asked(|i| {
+            let (mask, picture) = (&masks[i], &self.pictures[i]);
+            smooth(mask, picture.width(), picture.height()).iter().map(|v| (1.0 - v).clamp(0.03, 1.0)).collect()
+        })
     }
 
-    /// Colors of the object and of the rest, from the last masks or from where the cameras look.
-    fn colors(
-        &self,
-        near: &[Vec<f32>],
-        tables: &[Option<Table>],
-        last: Option<&Masks>,
-    ) -> Result<(Mixture, Mixture), SceneError> {
-        let (mut object, mut sure, mut rest, mut below) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
-        for (i, picture) in self.pictures.iter().enumerate() {
-            for (k, color) in picture.lab.iter().enumerate().filter(|(k, _)| picture.valid[*k]) {
-                let (inside, outside) = match last {
-                    Some(last) => (last.masks[i][k], !last.masks[i][k]),
-                    None => (near[i][k] < 0.55, near[i][k] > 0.95),
-                };
-                if outside {
-                    rest.push(*color);
-                }
-                if inside {
-                    object.push(*color);
-                }
-                if let Some(table) = &tables[i] {
-                    // Not what the table looks like there: no shadow, whatever its color.
-                    let least = if last.is_some() { 2.0 } else { 4.0 };
-                    if inside
-                        && table.trust[k] > 0.3
-                        && picture.smooth[k].distance(table.color[k]) > least * table.scale[k]
-                    {
-                        sure.push(*color);
-                    }
-                    if near[i][k] < 1.0 && table.trust[k] > 0.8 && table.scale[k] < 10.0 {
-                        below.push(table.color[k]);
-                    }
-                }
-            }
-        }
-        let enough = if last.is_some() { 0.3 } else { SURE };
-        if sure.len() as f64 >= enough * object.len() as f64 {
-            object = sure;
-        }
-        // The table about the object counts as much as all else: its shadows are what objects are mistaken for.
-        let mut behind = thinned(&rest, 4000);
-        behind.extend(thinned(&below, 3000));
-        match (Mixture::fit(&object, OBJECT, 0), Mixture::fit(&behind, BACKGROUND, 1)) {
-            (Some(object), Some(behind)) => Ok((object, behind)),
-            (None, _) => Err(SceneError::NotCutOut { reason: "nothing differs from what is around the object".into() }),
-            (_, None) => Err(SceneError::NotCutOut {
-                reason: "the object fills the photos: nothing shows the background".into(),
-            }),
-        }
+    /// Values of the views that others ask; of the rest none.
+    fn of_asked(&self, values: impl Fn(usize) -> Vec<f32>) -> Vec<Vec<f32>> {
+        let asked = plane::asked(self.pictures.len());
+        asked.iter().enumerate().map(|(i, asked)| if *asked { values(i) } else { Vec::new() }).collect()
     }
 }
 
-/// Every so manyth color, so that about `count` are left.
-fn thinned(colors: &[Vec3], count: usize) -> Vec<Vec3> {
-    colors.iter().step_by((colors.len() / count).max(1)).copied().collect()
+/// A small picture cut at these log odds, tidied by what colors alone and the hull's outline say. `near`: see [`Stage::nearness`].
+fn cut_small(
+    picture: &Picture,
+    near: &[f32],
+    odds: &[f32],
+    outline: Option<&[bool]>,
+    biased: impl Fn(usize) -> f32,
+) -> Vec<bool> {
+    let beyond = |k: usize| near[k] > 1.3 || !picture.valid[k];
+    let biased: Vec<f32> = (0..odds.len()).map(|k| if beyond(k) { -50.0 } else { biased(k) }).collect();
+    tidy(&cut(picture, &biased, None), odds, outline, picture)
+}
+
+/// A view's image at the small size.
+pub(crate) fn small(view: &View) -> RgbaImage {
+    picture::shrunk(view, SMALL).image
 }
 
 /// Whether masks at full size reach the border of their views.
@@ -418,7 +414,7 @@ pub(crate) fn cut_off(alpha: &[u8], w: u32, h: u32) -> bool {
 /// How far masks (the views' alpha) agree with their common hull, for each view: intersection over union. The hull is looked for in the
 /// sphere of this `radius` about `center`.
 pub fn agreement(views: &[View], center: DVec3, radius: f64) -> Vec<f64> {
-    let pictures: Vec<Picture> = views.par_iter().map(|v| Picture::of(v, SMALL)).collect();
+    let pictures: Vec<Picture> = views.par_iter().map(|v| Picture::outlined(v, SMALL)).collect();
     let masks: Vec<Vec<bool>> = pictures.iter().map(|p| p.valid.clone()).collect();
     match Hull::carve(&pictures, &masks, center, radius, None, 0, FINE) {
         Some(hull) => pictures.iter().zip(&masks).map(|(p, m)| overlap(&hull.outline(p), m)).collect(),
@@ -429,7 +425,7 @@ pub fn agreement(views: &[View], center: DVec3, radius: f64) -> Vec<f64> {
 /// How far each mask (the views' alpha) and those of the others contradict each other, 0 to 1: the share of it that lies outside of the
 /// others' hull, or the share of the others that it alone keeps out of the hull, on average; the larger of both. For three views or more.
 pub fn contradictions(views: &[View], center: DVec3, radius: f64) -> Vec<f64> {
-    let pictures: Vec<Picture> = views.par_iter().map(|v| Picture::of(v, SMALL)).collect();
+    let pictures: Vec<Picture> = views.par_iter().map(|v| Picture::outlined(v, SMALL)).collect();
     let masks: Vec<Vec<bool>> = pictures.iter().map(|p| p.valid.clone()).collect();
     evidence::contradictions(&pictures, &masks, center, radius)
 }
@@ -442,14 +438,17 @@ pub fn table_faces(views: &[View], whole: impl Fn(usize) -> Option<RgbaImage> + 
     let object: Vec<Vec<bool>> = views
         .par_iter()
         .map(|v| {
-            let p = Picture::of(v, SMALL);
+            let p = Picture::outlined(v, SMALL);
             grown(&p.valid, p.width(), p.height(), 4)
         })
         .collect();
     let pictures: Vec<Picture> = views
         .par_iter()
         .enumerate()
-        .map(|(k, v)| Some(Picture::of(&View { name: String::new(), camera: v.camera, image: whole(k)? }, SMALL)))
+        .map(|(k, v)| {
+            let whole = View { name: String::new(), camera: v.camera, image: whole(k)? };
+            Some(Picture::of(&whole, SMALL).into_comparable())
+        })
         .collect::<Option<_>>()?;
     let (plane, stands_out) = plane::find(&pictures, &object, center, mean_up(views), distance, &Stop::default())?;
     stands_out.then_some(plane.normal)

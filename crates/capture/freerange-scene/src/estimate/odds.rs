@@ -58,8 +58,7 @@ pub(super) fn odds(
                 Some(table) if table.trust[k] > 0.0 => {
                     let most = if shown.is_some() { TRUST_MENDING } else { TRUST };
                     let (trust, scale) = (most * table.trust[k], table.scale[k]);
-                    let off = picture.smooth[k].distance(table.color[k]);
-                    log_add(trust.ln() + log_likely(off, scale), (1.0 - trust).ln() + rest)
+                    log_add(trust.ln() + log_likely(table.off[k], scale), (1.0 - trust).ln() + rest)
                 }
                 _ => rest,
             };

@@ -8,6 +8,7 @@ pub const STEPS: [(i32, i32, f32); 4] =
     [(1, 0, 1.0), (0, 1, 1.0), (1, 1, std::f32::consts::SQRT_2), (-1, 1, std::f32::consts::SQRT_2)];
 
 /// A photo at working size.
+#[derive(Clone)]
 pub struct Picture {
     /// Its camera at this size.
     pub camera: Camera,
@@ -54,6 +55,22 @@ impl Picture {
         Self { camera, lab, smooth, valid, alike }
     }
 
+    /// What a hull needs of the view at that size: where it shows anything.
+    pub fn outlined(view: &View, side: u32) -> Self {
+        let View { camera, image, .. } = shrunk(view, side);
+        Self { valid: image.pixels().map(|p| p[3] >= 128).collect(), ..Self::blank(camera) }
+    }
+
+    /// The camera of the view at that size, and nothing that it shows.
+    pub fn unseen(view: &View, side: u32) -> Self {
+        let (w, h) = shrunk_to(view, side);
+        Self::blank(view.camera.resized(w, h))
+    }
+
+    fn blank(camera: Camera) -> Self {
+        Self { camera, lab: Vec::new(), smooth: Vec::new(), valid: Vec::new(), alike: Vec::new() }
+    }
+
     /// What other pictures are compared with: without its own colors and edges.
     pub fn into_comparable(mut self) -> Self {
         (self.lab, self.alike) = (Vec::new(), Vec::new());
@@ -78,11 +95,16 @@ impl Picture {
 
 /// The view with its longer side at most `side` pixels.
 pub fn shrunk(view: &View, side: u32) -> View {
+    let (w, h) = shrunk_to(view, side);
+    View { name: view.name.clone(), camera: view.camera.resized(w, h), image: resize_area(&view.image, w, h) }
+}
+
+/// Width and height of the view with its longer side at most `side` pixels.
+fn shrunk_to(view: &View, side: u32) -> (u32, u32) {
     let (w, h) = view.image.dimensions();
     let longer = w.max(h);
     let small = |s: u32| ((u64::from(s) * u64::from(side) + u64::from(longer) / 2) / u64::from(longer)).max(1) as u32;
-    let (w, h) = if longer > side { (small(w), small(h)) } else { (w, h) };
-    View { name: view.name.clone(), camera: view.camera.resized(w, h), image: resize_area(&view.image, w, h) }
+    if longer > side { (small(w), small(h)) } else { (w, h) }
 }
 
 fn neighbor(x: usize, y: usize, dx: i32, dy: i32, w: usize, h: usize) -> Option<usize> {

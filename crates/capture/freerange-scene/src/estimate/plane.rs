@@ -168,13 +168,18 @@ fn disagreement(
 
 /// What a view would show without the object, as far as it shows the plane.
 pub struct Table {
-    /// The plane's color, `[h, w]`.
-    pub color: Vec<Vec3>,
-    /// How far it can be relied on, 0 to 1.
+    /// How far the view is from the plane's color, `[h, w]` (Lab).
+    pub off: Vec<f32>,
+    /// How far that color can be relied on, 0 to 1.
     pub trust: Vec<f32>,
     /// How far colors may differ from it and still be the plane's (Lab).
     pub scale: Vec<f32>,
+    /// That color, in order, where it was asked for and is sure.
+    pub beneath: Vec<Vec3>,
 }
+
+/// Least trust and largest scale of a color that is sure.
+const SURE: (f32, f32) = (0.8, 10.0);
 
 /// Other views to ask about view `i`: all, or some that are spread evenly.
 fn others(count: usize, i: usize) -> Vec<usize> {
@@ -185,17 +190,43 @@ fn others(count: usize, i: usize) -> Vec<usize> {
     }
 }
 
-/// The table of view `i`, at the pixels `wanted` (`[h, w]`). `background`: how likely each pixel of each view is not the object, `[h, w]`.
+/// Which of so many views any other asks: at most two for each that one of them does.
+pub fn asked(count: usize) -> Vec<bool> {
+    let mut asked = vec![false; count];
+    (0..count).flat_map(|i| others(count, i)).for_each(|j| asked[j] = true);
+    asked
+}
+
+/// The weighted median of each channel; `total` is the sum of the weights, `channel` room for one.
+fn median(seen: &[(Vec3, f32)], total: f32, channel: &mut Vec<(f32, f32)>) -> Vec3 {
+    let of_channel = |c: usize| {
+        channel.clear();
+        channel.extend(seen.iter().map(|(v, weight)| (v[c], *weight)));
+        channel.sort_by(|p, q| p.0.total_cmp(&q.0));
+        let mut sum = 0.0;
+        let half = channel.iter().find(|(_, weight)| {
+            sum += weight;
+            sum >= 0.5 * total
+        });
+        half.map_or(0.0, |v| v.0)
+    };
+    [0, 1, 2].map(of_channel).into()
+}
+
+/// The table of view `i`, whose own picture is `picture`, at the pixels `wanted` (`[h, w]`). `pictures`, and `background` (how likely each pixel of each
+/// view is not the object, `[h, w]`): of all views, but only of those that are [`asked`] more than cameras. `beneath`: at which pixels its
+/// color is asked for.
 pub fn table(
     pictures: &[Picture],
     background: &[Vec<f32>],
     i: usize,
+    picture: &Picture,
     center: DVec3,
     plane: &Plane,
     distance: f64,
     wanted: impl Fn(usize) -> bool + Sync,
+    beneath: impl Fn(usize) -> bool,
 ) -> Table {
-    let picture = &pictures[i];
     let (w, h) = (picture.width(), picture.height());
     let others = others(pictures.len(), i);
     let eye = picture.camera.center();
@@ -236,18 +267,7 @@ pub fn table(
                         return unknown;
                     }
                     let total: f32 = seen.iter().map(|s| s.1).sum();
-                    let mut color = Vec3::ZERO;
-                    for c in 0..3 {
-                        channel.clear();
-                        channel.extend(seen.iter().map(|(v, weight)| (v[c], *weight)));
-                        channel.sort_by(|p, q| p.0.total_cmp(&q.0));
-                        let mut sum = 0.0;
-                        let half = channel.iter().find(|(_, weight)| {
-                            sum += weight;
-                            sum >= 0.5 * total
-                        });
-                        color[c] = half.map_or(0.0, |v| v.0);
-                    }
+                    let color = median(&seen, total, &mut channel);
                     let spread =
                         seen.iter().map(|(v, weight)| weight * v.distance(color).min(40.0)).sum::<f32>() / total;
                     (color, ((total - 0.5) / 1.5).clamp(0.0, 1.0), 2.0 + 1.5 * spread)
@@ -256,9 +276,14 @@ pub fn table(
         })
         .collect();
     let flat = || rows.iter().flatten();
+    let sure = |&(k, (_, trust, scale)): &(usize, &(Vec3, f32, f32))| *trust > SURE.0 && *scale < SURE.1 && beneath(k);
+    let mut beneath: Vec<Vec3> = flat().enumerate().filter(sure).map(|(_, (color, ..))| *color).collect();
+    // Held for all views.
+    beneath.shrink_to_fit();
     Table {
-        color: flat().map(|v| v.0).collect(),
+        off: flat().zip(&picture.smooth).map(|((color, ..), own)| own.distance(*color)).collect(),
         trust: flat().map(|v| v.1).collect(),
         scale: flat().map(|v| v.2).collect(),
+        beneath,
     }
 }

@@ -7,7 +7,7 @@ use super::{
 use crate::camera::{Camera, Lens, nearest_point};
 use crate::{
     SceneError,
-    decode::{decode, size_of},
+    decode::{decode, has_alpha, size_of},
     error::In,
     read::{Cameras, Photo},
 };
@@ -118,7 +118,8 @@ fn outline(
     let size = size_of(&photo.image)?;
     let share = match (mask, &config.masks) {
         (Some(mask), _) => read_mask(mask, size, config.invert_masks)?,
-        (None, MaskSource::Auto | MaskSource::Alpha) => {
+        // An opaque photo shows no outline, and is not decoded to hear of that.
+        (None, MaskSource::Auto | MaskSource::Alpha) if has_alpha(&photo.image)? => {
             let image = decode(&photo.image)?.image;
             GrayImage::from_fn(image.width(), image.height(), |x, y| Luma([image.get_pixel(x, y)[3]]))
         }

@@ -1,7 +1,10 @@
 //! Views without what is around the object: by mask files, alpha, a plain backdrop, a network, or poses and colors.
 
 use super::{LoadConfig, MaskKind, MaskSource, memory};
-use crate::camera::{View, scene::cut_out};
+use crate::camera::{
+    View,
+    scene::{Backdrop, find_backdrop},
+};
 use crate::{
     SceneError,
     estimate::{self, Estimate, Hints},
@@ -15,8 +18,9 @@ fn opaque(image: &RgbaImage) -> bool {
     image.pixels().all(|p| p[3] == 255)
 }
 
-pub(super) fn plain(view: &View) -> Result<RgbaImage, SceneError> {
-    cut_out(&view.image).map(|(image, _)| image).map_err(|found| SceneError::Mask {
+/// The plain backdrop of a view.
+pub(super) fn plain(view: &View) -> Result<Backdrop, SceneError> {
+    find_backdrop(&view.image).map_err(|found| SceneError::Mask {
         name: view.name.clone(),
         expected: "an alpha channel, or one plain color behind the object".into(),
         found,
@@ -81,9 +85,10 @@ fn mask_all(
         return Ok((kind, None));
     }
     memory::check_estimate(views, config)?;
-    let estimate = estimate::masks_until(views, &config.hints, &config.stop)?;
-    for (view, alpha) in views.iter_mut().zip(&estimate.alpha) {
-        set_alpha(&mut view.image, alpha);
+    let mut estimate = estimate::masks_until(views, &config.hints, &config.stop)?;
+    // From here on they are the views' own.
+    for (view, alpha) in views.iter_mut().zip(std::mem::take(&mut estimate.alpha)) {
+        set_alpha(&mut view.image, &alpha);
     }
     notes.push(Note::understood(format!(
         "the object was cut out from poses and colors, {:.0} % sure (views agree to {:.0} % at least)",
@@ -127,7 +132,8 @@ fn by_alpha_or_backdrop(
     notes: &mut Vec<Note>,
 ) -> Result<Option<MaskKind>, SceneError> {
     let with_alpha = told.iter().filter(|p| p.alpha).count();
-    let tried: Result<Vec<Option<RgbaImage>>, SceneError> = views
+    // Where the backdrops are: a quarter of the memory that cut out photos would take, as long as some may have none.
+    let tried: Result<Vec<Option<Backdrop>>, SceneError> = views
         .par_iter()
         .zip(told)
         .map(|(view, picture)| match (picture.alpha, &config.masks) {
@@ -142,17 +148,17 @@ fn by_alpha_or_backdrop(
         })
         .collect();
     match tried {
-        Ok(images) => {
-            let cut = images.iter().flatten().count();
-            if cut < images.len() {
-                let own = images.len() - cut;
+        Ok(backdrops) => {
+            let cut = backdrops.iter().flatten().count();
+            if cut < backdrops.len() {
+                let own = backdrops.len() - cut;
                 notes.push(Note::understood(format!("masks are the alpha of {own} photos")));
             }
-            for (view, image) in views.iter_mut().zip(images) {
-                if let Some(image) = image {
-                    view.image = image;
+            views.par_iter_mut().zip(backdrops).for_each(|(view, backdrop)| {
+                if let Some(backdrop) = backdrop {
+                    view.image = backdrop.separate(&view.image);
                 }
-            }
+            });
             if cut > 0 {
                 notes.push(Note::understood(format!("the plain background of {cut} photos was cut away")));
             }

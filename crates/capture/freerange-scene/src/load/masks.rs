@@ -175,7 +175,7 @@ pub(super) enum Meaning {
 }
 
 /// What the masks of `pictures` mean.
-pub(super) fn meaning(pictures: &[Picture]) -> Meaning {
+pub(super) fn meaning(pictures: &mut [Picture]) -> Meaning {
     let looks: Vec<(f64, f64)> = pictures.iter().map(|p| p.mask_covers).collect();
     let many = |ok: &dyn Fn(&(f64, f64)) -> bool| 5 * looks.iter().filter(|l| ok(l)).count() >= 4 * looks.len();
     if !many(&|(along, _)| *along >= ALONG_BORDER) {
@@ -189,19 +189,31 @@ pub(super) fn meaning(pictures: &[Picture]) -> Meaning {
 }
 
 /// Whether the black parts of masks belong to one thing in space.
-fn have_one_hull(pictures: &[Picture]) -> bool {
-    let views: Vec<View> = pictures
-        .iter()
-        .filter_map(|p| {
-            let mut image = p.image.clone();
-            for (pixel, share) in image.pixels_mut().zip(p.mask.as_ref()?.pixels()) {
-                pixel[3] = pixel[3].min(255 - share[0]);
-            }
-            Some(View { name: String::new(), camera: p.camera, image })
-        })
-        .collect();
-    let Ok(frame) = canonical_from_user(&views, &FrameConfig::default()) else { return false };
+fn have_one_hull(pictures: &mut [Picture]) -> bool {
+    let (mut masked, mut alphas, mut views) = (Vec::new(), Vec::new(), Vec::new());
+    // The images themselves, for as long with another alpha: copies would take as much memory again.
+    for picture in pictures {
+        let Some(mask) = &picture.mask else { continue };
+        let mut image = std::mem::take(&mut picture.image);
+        alphas.push(image.pixels().map(|pixel| pixel[3]).collect::<Vec<u8>>());
+        for (pixel, share) in image.pixels_mut().zip(mask.pixels()) {
+            pixel[3] = pixel[3].min(255 - share[0]);
+        }
+        views.push(View { name: String::new(), camera: picture.camera, image });
+        masked.push(picture);
+    }
+    let one = are_one_object(&views);
+    for ((picture, view), alpha) in masked.into_iter().zip(views).zip(alphas) {
+        picture.image = view.image;
+        picture.image.pixels_mut().zip(alpha).for_each(|(pixel, alpha)| pixel[3] = alpha);
+    }
+    one
+}
+
+/// Whether masks, the views' alpha, agree with their common hull.
+fn are_one_object(views: &[View]) -> bool {
+    let Ok(frame) = canonical_from_user(views, &FrameConfig::default()) else { return false };
     let back = frame.canonical_from_user.inverse();
-    let agreement = estimate::agreement(&views, back.apply(DVec3::ZERO), 1.5 * CANONICAL_RADIUS * back.scale);
+    let agreement = estimate::agreement(views, back.apply(DVec3::ZERO), 1.5 * CANONICAL_RADIUS * back.scale);
     agreement.iter().sum::<f64>() >= ONE_OBJECT * agreement.len() as f64
 }

@@ -9,12 +9,12 @@ mod picture;
 mod whole;
 
 pub use cut::cut;
-pub use whole::Whole;
+pub use whole::{KeepWhole, Whole};
 
 use crate::camera::{
     Lens, Up, View,
     image_ops::{resize_area, shrunk_size},
-    scene::{cut_out, fills_frame},
+    scene::{fills_frame, find_backdrop},
 };
 use crate::{
     SceneError,
@@ -90,8 +90,8 @@ pub struct LoadConfig {
     /// Most bytes that photos, masks and what masks are estimated with take at a time. Checked from the files' heads before anything is
     /// decoded, and again before masks are estimated.
     pub memory: u64,
-    /// Folder that whole photos are written to ([`Whole::Files`]) instead of being held.
-    pub whole_folder: Option<PathBuf>,
+    /// What is kept of whole photos.
+    pub whole: KeepWhole,
     /// When reading has to end early.
     pub stop: Stop,
 }
@@ -104,7 +104,7 @@ impl Default for LoadConfig {
             max_side: 1024,
             hints: Hints::default(),
             memory: 16 << 30,
-            whole_folder: None,
+            whole: KeepWhole::Small,
             stop: Stop::default(),
         }
     }
@@ -117,13 +117,13 @@ pub struct Loaded {
     pub views: Vec<View>,
     /// Which of [`Cameras::photos`] each view is.
     pub photos: Vec<usize>,
-    /// The whole photo of each view, undistorted.
+    /// The whole photo of each view, undistorted: as [`LoadConfig::whole`] says.
     pub whole: Whole,
     /// Further views, only compared with.
     pub further: Vec<View>,
     /// How the object was told from the rest.
     pub masks: MaskKind,
-    /// What came with masks that were estimated.
+    /// What came with masks that were estimated, without them: they are the views' alpha.
     pub estimate: Option<Estimate>,
     /// What was understood, assumed, changed or left out, for the user to read.
     pub notes: Vec<Note>,
@@ -144,7 +144,7 @@ pub fn load(cameras: &Cameras, config: &LoadConfig) -> Result<Loaded, SceneError
     let mut notes = Vec::new();
     let masks = mask_files(cameras, config, &mut notes)?;
     let aim = Aim::of(cameras, &masks.of, config)?;
-    memory::check_photos(cameras, &masks.of, config)?;
+    memory::check_photos(cameras, config)?;
     let mut pictures = pictures_of(cameras, &inputs, &masks, aim.as_ref(), config)?;
     tell(&pictures, cameras, &inputs, &mut notes);
     let usable = look_at_masks(cameras, &mut pictures, &masks, config, &mut notes)?;
@@ -169,6 +169,7 @@ pub fn load(cameras: &Cameras, config: &LoadConfig) -> Result<Loaded, SceneError
     }
     let (kind, estimate) =
         cut_all(&mut views, &told, config, &mut notes).map_err(|error| with_warnings(error, &notes))?;
+    drop(told);
     let mut compared = pictures_of(cameras, &further, &masks, aim.as_ref(), config)?;
     if usable {
         compared.iter_mut().for_each(Picture::only_usable);
@@ -291,7 +292,7 @@ fn without_rims(pictures: &mut [Picture], what: &str, config: &LoadConfig, notes
     for p in pictures.iter_mut().filter(|p| p.alpha) {
         let (w, h) = p.image.dimensions();
         // Or what it leaves is the object before a plain backdrop.
-        p.alpha = !(all_same || fills_frame(&shown(p), w, h, RIM_FILL) && cut_out(&p.image).is_ok());
+        p.alpha = !(all_same || fills_frame(&shown(p), w, h, RIM_FILL) && find_backdrop(&p.image).is_ok());
         count += usize::from(!p.alpha);
     }
     if count > 0 {
@@ -311,7 +312,8 @@ fn further_views(pictures: Vec<Picture>, which: &[usize], names: &[String], note
             if let Some(mask) = &p.mask {
                 set_alpha(&mut view.image, mask.as_raw());
             } else if !p.alpha {
-                view.image = plain(&view).map_err(|_| view.name.clone())?;
+                let backdrop = plain(&view).map_err(|_| view.name.clone())?;
+                view.image = backdrop.separate(&view.image);
             }
             Ok(view)
         })

@@ -56,16 +56,14 @@ pub(super) fn picture(
     let Decoded { mut image, orientation, converted } = decode(&photo.image)?;
     let mut turned = false;
     let mut camera = photo.camera(image.dimensions());
-    if orientation != Orientation::NoTransforms {
-        let mut upright = DynamicImage::ImageRgba8(image.clone());
+    // Cameras were made for the stored pixels, if those fit; but for those of which it is known otherwise.
+    let upright_camera = matches!(photo.intrinsics, Intrinsics::Relative { upright: true, .. });
+    if orientation != Orientation::NoTransforms && (upright_camera || camera.is_err()) {
+        let mut upright = DynamicImage::ImageRgba8(image);
         upright.apply_orientation(orientation);
-        // Cameras were made for the stored pixels, if those fit; but for those of which it is known otherwise.
-        let upright_camera = matches!(photo.intrinsics, Intrinsics::Relative { upright: true, .. });
-        if upright_camera || camera.is_err() {
-            image = upright.into_rgba8();
-            camera = photo.camera(image.dimensions());
-            turned = true;
-        }
+        image = upright.into_rgba8();
+        camera = photo.camera(image.dimensions());
+        turned = true;
     }
     let mut camera = camera?;
     let size = image.dimensions();

@@ -1,4 +1,4 @@
-//! Whole photos, beside what was cut out of them: in memory, or in files.
+//! Whole photos, beside what was cut out of them: small ones, all in memory, or in files.
 
 use std::{
     borrow::Cow,
@@ -13,28 +13,44 @@ use image::{
 use rayon::prelude::*;
 
 use super::LoadConfig;
-use crate::{SceneError, camera::View};
+use crate::{SceneError, camera::View, estimate};
+
+/// What is kept of whole photos, beside what is cut out of them.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum KeepWhole {
+    /// Small ones, of at most 320 pixels a side: enough to find the table.
+    #[default]
+    Small,
+    /// All of them, in memory.
+    Memory,
+    /// All of them, as PNG files in this folder.
+    Folder(PathBuf),
+}
 
 /// The whole photo of each view, undistorted.
 #[derive(Clone, Debug)]
 pub enum Whole {
     /// As images.
     Memory(Vec<RgbaImage>),
+    /// As images of at most 320 pixels a side.
+    Small(Vec<RgbaImage>),
     /// As PNG files, which hold the same pixels.
     Files(Vec<PathBuf>),
 }
 
 impl Default for Whole {
     fn default() -> Self {
-        Self::Memory(Vec::new())
+        Self::Small(Vec::new())
     }
 }
 
 impl Whole {
     /// Keeps the images of views that are not cut out yet.
     pub(super) fn of(views: &[View], config: &LoadConfig) -> Result<Self, SceneError> {
-        let Some(folder) = &config.whole_folder else {
-            return Ok(Self::Memory(views.iter().map(|v| v.image.clone()).collect()));
+        let folder = match &config.whole {
+            KeepWhole::Small => return Ok(Self::Small(views.par_iter().map(estimate::small).collect())),
+            KeepWhole::Memory => return Ok(Self::Memory(views.iter().map(|v| v.image.clone()).collect())),
+            KeepWhole::Folder(folder) => folder,
         };
         let write = |(k, view): (usize, &View)| {
             config.stop.check()?;
@@ -45,7 +61,7 @@ impl Whole {
         Ok(Self::Files(views.par_iter().enumerate().map(write).collect::<Result<_, SceneError>>()?))
     }
 
-    /// The whole photo of view `k`.
+    /// The whole photo of view `k`, small where no more is kept.
     ///
     /// # Errors
     /// Where its file is not there any more.
@@ -54,7 +70,7 @@ impl Whole {
     /// Where there is no view `k`.
     pub fn get(&self, k: usize) -> Result<Cow<'_, RgbaImage>, SceneError> {
         match self {
-            Self::Memory(images) => Ok(Cow::Borrowed(&images[k])),
+            Self::Memory(images) | Self::Small(images) => Ok(Cow::Borrowed(&images[k])),
             Self::Files(files) => match image::open(&files[k]) {
                 Ok(image) => Ok(Cow::Owned(image.into_rgba8())),
                 Err(e) => Err(SceneError::Image { file: files[k].clone(), source: Box::new(e) }),

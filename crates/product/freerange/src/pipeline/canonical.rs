@@ -1,21 +1,51 @@
 //! Step 1, canonicalize. In: views in the user's frame. Out: the same in the canonical frame (the object within radius 0.5
-//! about the origin, +z up), cropped to squares about the object, and the choice of those that the network sees.
+//! about the origin, +z up), cropped to squares about the object, and the choice of those that the network sees. Pixels stay
+//! with the user: whoever compares with them copies what it needs, at the size that it needs.
 //!
 //! Masks and cameras give a first frame; where the scene does not already lie in the canonical one, a short fit corrects it
 //! (docs/research/experiments/initial-fits.md). Cost: a third of a second for that fit.
 
 use freerange_gaussians::Gaussians;
-use freerange_optim::{frame_of, initial_fit};
-use freerange_scene::camera::{Similarity, View, Window};
+use freerange_optim::{PosedImage, frame_of, initial_fit};
+use freerange_scene::camera::{Camera, Similarity, View, Window, canonical_from_user};
 use freerange_util::Note;
 
 use super::watch::Watch;
-use crate::{Detect, Error, Options, Stage, choose_views, error::Lift, to_canonical};
+use crate::{Detect, Error, Options, Stage, choose_views, error::Lift};
+
+/// One of the user's photos in the canonical frame, cropped.
+#[derive(Clone, Copy)]
+pub(crate) struct Photo<'v> {
+    view: &'v View,
+    /// The part of it that is used; none: all of it.
+    window: Option<Window>,
+    /// The camera of that part.
+    camera: Camera,
+}
+
+impl<'v> Photo<'v> {
+    /// `view`, whose camera in the canonical frame is `camera`.
+    fn new(view: &'v View, camera: Camera) -> Self {
+        let window = Window::framed_in(&camera, &view.image);
+        Self { view, window, camera: window.map_or(camera, |window| window.camera(&camera)) }
+    }
+
+    /// Without a copy of its pixels.
+    pub fn posed(&self) -> PosedImage<'v> {
+        PosedImage { camera: self.camera, window: self.window, ..self.view.into() }
+    }
+
+    /// As a view of its own.
+    pub fn view(&self) -> View {
+        let image = self.window.map_or_else(|| self.view.image.clone(), |window| window.image(&self.view.image));
+        View { name: self.view.name.clone(), camera: self.camera, image }
+    }
+}
 
 /// The views of an object in the canonical frame.
-pub(crate) struct CanonicalScene {
-    /// All of them, cropped.
-    pub photos: Vec<View>,
+pub(crate) struct CanonicalScene<'v> {
+    /// All of them.
+    pub photos: Vec<Photo<'v>>,
     /// Which of them the network sees, ascending.
     pub network_views: Vec<usize>,
     /// From the frame of the views to the canonical one.
@@ -26,21 +56,18 @@ pub(crate) struct CanonicalScene {
     pub fit: Option<Gaussians>,
 }
 
-impl CanonicalScene {
+impl<'v> CanonicalScene<'v> {
     /// Checks the views and takes them to the canonical frame.
-    pub fn new(views: &[View], options: &Options, watch: &mut Watch<'_>) -> Result<Self, Error> {
+    pub fn new(views: &'v [View], options: &Options, watch: &mut Watch<'_>) -> Result<Self, Error> {
         check_views(views)?;
         let config = &options.pipeline;
         watch.report(Stage::Canonicalize, [0, 1], None, None)?;
-        let (frame, mut photos) = to_canonical(views, &options.frame)?;
+        let frame = canonical_from_user(views, &options.frame).lift()?;
+        let place = &frame.canonical_from_user;
+        let photos: Vec<Photo<'_>> =
+            views.iter().map(|view| Photo::new(view, view.camera.transformed(place))).collect();
         let mut notes: Vec<Note> = frame.notes.into_iter().map(Note::understood).collect();
-        let mut cropped = 0;
-        for view in &mut photos {
-            if let Some(window) = Window::framed(view) {
-                *view = window.cut(view).into_owned();
-                cropped += 1;
-            }
-        }
+        let cropped = photos.iter().filter(|photo| photo.window.is_some()).count();
         let all = views.len();
         if cropped > 0 {
             notes.push(Note::changed(format!("{cropped} of {all} views are cropped to squares about the object")));
@@ -51,7 +78,7 @@ impl CanonicalScene {
             let names: Vec<&str> = network_views.iter().map(|&i| views[i].name.as_str()).collect();
             notes.push(Note::understood(format!("the network sees {seen} of {all} views: {}", names.join(", "))));
         }
-        let uneven = network_views.iter().map(|&i| &photos[i].image).filter(|i| i.width() != i.height()).count();
+        let uneven = network_views.iter().map(|&i| &photos[i].camera).filter(|c| c.width != c.height).count();
         if uneven > 0 {
             notes.push(Note::changed(format!(
                 "{uneven} of {seen} views of the network are not square: it sees squares, cropped or padded"
@@ -77,7 +104,7 @@ impl CanonicalScene {
 
     /// The views that the network sees.
     pub fn network_views(&self) -> Vec<View> {
-        self.network_views.iter().map(|&i| self.photos[i].clone()).collect()
+        self.network_views.iter().map(|&i| self.photos[i].view()).collect()
     }
 
     /// Moves the frame to where the fit says that the object is.
@@ -85,7 +112,7 @@ impl CanonicalScene {
         let Some(fit) = &mut self.fit else { return Ok(()) };
         let correction = frame_of(fit, shown).lift()?;
         fit.transform(correction.scale, correction.rotation, correction.translation);
-        self.photos.iter_mut().for_each(|view| view.camera = view.camera.transformed(&correction));
+        self.photos.iter_mut().for_each(|photo| photo.camera = photo.camera.transformed(&correction));
         self.canonical_from_user = correction.after(&self.canonical_from_user);
         let (shift, scale) = (correction.translation.length(), correction.scale);
         let text = format!("the initial fit moved the frame by {shift:.3} and scaled it by {scale:.3}");

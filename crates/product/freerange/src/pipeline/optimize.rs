@@ -2,7 +2,7 @@
 //! [`max_gaussians`](crate::OptimizeConfig::max_gaussians), by 3DGS-MCMC on the photos from all proposals together. Where no
 //! photo looks, the mean renders of the proposals anchor it ([`freerange_optim::optimize`]; docs/research/experiments/proposals.md).
 //!
-//! Cost: half of the pipeline's time; memory of the photos at `max_resolution`.
+//! Cost: half of the pipeline's time; memory of the photos at `max_resolution`, and at half of it.
 
 use freerange_gaussians::Gaussians;
 use freerange_optim::{AnchorConfig, OptimizationConfig};
@@ -12,8 +12,8 @@ use crate::{Error, OptimizeConfig, Stage};
 
 /// Optimizes the proposals on the photos; without iterations the first of them is the result.
 pub(crate) fn optimize(
-    scene: &CanonicalScene,
-    targets: &Targets,
+    scene: &CanonicalScene<'_>,
+    targets: &Targets<'_>,
     config: &OptimizeConfig,
     proposals: &[Gaussians],
     seed: u64,
@@ -30,7 +30,7 @@ pub(crate) fn optimize(
     };
     let steps = OptimizationConfig { steps: config.iterations, anchors, seed, ..OptimizationConfig::default() };
     let evidence = targets.of_optimization();
-    let side = evidence.views.iter().map(|view| view.image.width().max(view.image.height())).max().unwrap_or(0);
+    let side = evidence.views.iter().map(|view| view.camera.width.max(view.camera.height)).max().unwrap_or(0);
     let steps = steps.detailed(config.detail(), side).for_photos(targets.photos());
     watch.fit(Stage::Optimize, steps.steps, &scene.canonical_from_user, |progress| {
         freerange_optim::optimize(first, others, evidence, &steps, progress)

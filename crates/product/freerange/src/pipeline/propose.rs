@@ -27,8 +27,8 @@ const MOST: u64 = 64;
 /// Makes the proposals of a seed.
 pub(crate) fn propose(
     model: &Reconstructor,
-    scene: &mut CanonicalScene,
-    targets: &Targets,
+    scene: &mut CanonicalScene<'_>,
+    targets: &Targets<'_>,
     options: &Options,
     seed: u64,
     watch: &mut Watch<'_>,
@@ -65,8 +65,8 @@ pub(crate) fn propose(
 
 /// As many initial fits, beside each other.
 fn fits(
-    scene: &CanonicalScene,
-    targets: &Targets,
+    scene: &CanonicalScene<'_>,
+    targets: &Targets<'_>,
     options: &Options,
     [seed, count]: [u64; 2],
     watch: &mut Watch<'_>,

@@ -24,8 +24,8 @@ pub(crate) type OnEstimate<'a> = dyn FnMut(&Estimate<'_>) -> ControlFlow<()> + '
 /// Lets the network correct each proposal.
 pub(crate) fn refine(
     model: &Reconstructor,
-    scene: &CanonicalScene,
-    targets: &Targets,
+    scene: &CanonicalScene<'_>,
+    targets: &Targets<'_>,
     options: &Options,
     proposals: Vec<Gaussians>,
     watch: &mut Watch<'_>,
@@ -49,7 +49,7 @@ pub(crate) fn refine(
 pub(crate) fn each(
     model: &Reconstructor,
     stage: Stage,
-    scene: &CanonicalScene,
+    scene: &CanonicalScene<'_>,
     [count, steps]: [usize; 2],
     make: &(dyn Fn(usize, &mut OnEstimate<'_>) -> Result<Gaussians, Error> + Sync),
     watch: &mut Watch<'_>,

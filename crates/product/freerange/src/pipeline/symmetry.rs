@@ -8,7 +8,7 @@
 use std::ops::ControlFlow;
 
 use freerange_optim::{
-    Axis, Evidence, FitError, FoundAxis, FoundMirror, Mirror, Silhouette, axis_steps, find_axis, find_mirror,
+    Axis, Evidence, FitError, FoundAxis, FoundMirror, Mirror, PosedImage, axis_steps, find_axis, find_mirror,
     mirror_steps, mirrored, turned,
 };
 use freerange_scene::camera::View;
@@ -16,6 +16,7 @@ use freerange_util::{Note, side_by_side};
 
 use super::{
     CanonicalScene,
+    canonical::Photo,
     watch::{Watch, flow},
 };
 use crate::{Detect, Error, PipelineConfig, Stage, error::Lift};
@@ -43,21 +44,21 @@ pub(crate) struct Symmetry {
 }
 
 /// What fits, the network and the optimization should agree with.
-pub(crate) struct Targets {
+pub(crate) struct Targets<'v> {
     /// The network's views, and their mirror images.
     network: Vec<View>,
     /// How many of them are photos.
     network_photos: usize,
-    /// All photos, and after them their mirror images.
-    views: Vec<View>,
-    /// How many of them are photos.
-    photos: usize,
+    /// All photos.
+    photos: Vec<Photo<'v>>,
+    /// Their mirror images.
+    mirrored: Vec<View>,
     axis: Option<Axis>,
 }
 
 /// Looks for symmetries, unless that is switched off or there are more than four photos.
 pub(crate) fn detect(
-    scene: &CanonicalScene,
+    scene: &CanonicalScene<'_>,
     config: &PipelineConfig,
     watch: &mut Watch<'_>,
 ) -> Result<Symmetry, Error> {
@@ -124,23 +125,24 @@ pub(crate) fn detect(
 impl Symmetry {
     /// The targets, with what the symmetry adds. They take the scene's photos; notes go to the scene; a fit of photos alone is
     /// dropped where there is more.
-    pub fn targets(self, scene: &mut CanonicalScene) -> Targets {
+    pub fn targets<'v>(self, scene: &mut CanonicalScene<'v>) -> Targets<'v> {
         let mut network = scene.network_views();
-        let mut views = std::mem::take(&mut scene.photos);
-        let (network_photos, photos) = (network.len(), views.len());
+        let photos = std::mem::take(&mut scene.photos);
+        let (network_photos, mut mirror_images) = (network.len(), Vec::new());
         if let Some(mirror) = &self.mirror {
             network.extend(mirrored(&network, mirror));
-            views.extend(mirrored(&views, mirror));
+            let views: Vec<View> = photos.iter().map(Photo::view).collect();
+            mirror_images = mirrored(&views, mirror);
         }
         if self.mirror.is_some() || self.axis.is_some() {
             scene.fit = None;
         }
         scene.notes.extend(self.notes);
-        Targets { network, network_photos, views, photos, axis: self.axis }
+        Targets { network, network_photos, photos, mirrored: mirror_images, axis: self.axis }
     }
 }
 
-impl Targets {
+impl Targets<'_> {
     /// What the network sees.
     pub fn network_views(&self) -> &[View] {
         &self.network
@@ -148,21 +150,25 @@ impl Targets {
 
     /// What initial fits agree with.
     pub fn of_fits(&self) -> Evidence<'_> {
-        Evidence { views: &self.network, silhouettes: self.silhouettes(&self.network[..self.network_photos]) }
+        let views: Vec<PosedImage<'_>> = self.network.iter().map(PosedImage::from).collect();
+        Evidence { silhouettes: self.silhouettes(&views[..self.network_photos]), views }
     }
 
     /// How many photos there are, without what a symmetry adds.
     pub fn photos(&self) -> usize {
-        self.photos
+        self.photos.len()
     }
 
     /// What the optimization agrees with.
     pub fn of_optimization(&self) -> Evidence<'_> {
-        Evidence { views: &self.views, silhouettes: self.silhouettes(&self.views[..self.photos]) }
+        let mut views: Vec<PosedImage<'_>> = self.photos.iter().map(Photo::posed).collect();
+        let silhouettes = self.silhouettes(&views);
+        views.extend(self.mirrored.iter().map(PosedImage::from));
+        Evidence { views, silhouettes }
     }
 
     /// Silhouettes of `photos` rotated about the axis, if there is one.
-    fn silhouettes<'a>(&self, photos: &'a [View]) -> Vec<Silhouette<'a>> {
+    fn silhouettes<'a>(&self, photos: &[PosedImage<'a>]) -> Vec<PosedImage<'a>> {
         self.axis.as_ref().map_or_else(Vec::new, |axis| turned(photos, axis))
     }
 }

@@ -29,6 +29,12 @@ fn near(p: &Rgba<u8>, background: [u8; 3]) -> bool {
 ///
 /// Undistorted photos have an empty rim: transparent, or black. It is no backdrop. The border is then that of what is shown.
 pub fn cut_out(image: &RgbaImage) -> Result<(RgbaImage, [u8; 3]), String> {
+    let found = find_backdrop(image)?;
+    Ok((found.separate(image), found.color))
+}
+
+/// The plain backdrop of an image, or what it shows instead: what [`cut_out`] looks for.
+pub(crate) fn find_backdrop(image: &RgbaImage) -> Result<Backdrop, String> {
     let (w, h) = image.dimensions();
     if w < 8 || h < 8 {
         return Err(format!("an image of {w} x {h} pixels, too small to judge"));
@@ -37,19 +43,19 @@ pub fn cut_out(image: &RgbaImage) -> Result<(RgbaImage, [u8; 3]), String> {
     let found = backdrop(image, &shown);
     // Black along the border may be a rim, with the backdrop within it.
     if found.as_ref().is_ok_and(|b| b.color.iter().any(|c| *c > BACKGROUND_TOLERANCE)) {
-        return found.map(|b| separate(image, &b));
+        return found;
     }
     if let Some(inner) = without_black_rim(image, &shown)
         && let Ok(within) = backdrop(image, &inner)
         && within.color.iter().any(|c| *c > 2 * BACKGROUND_TOLERANCE)
     {
-        return Ok(separate(image, &within));
+        return Ok(within);
     }
-    found.map(|b| separate(image, &b))
+    found
 }
 
 /// A plain backdrop: its color, and for every pixel 0 where it or nothing is shown, else `u8::MAX`.
-struct Backdrop {
+pub(crate) struct Backdrop {
     color: [u8; 3],
     depth: Vec<u8>,
 }
@@ -159,37 +165,39 @@ pub fn fills_frame(shown: &[bool], w: u32, h: u32, least: f64) -> bool {
     count as f64 >= least * shown.len() as f64 && near(low.0, high.0, w) && near(low.1, high.1, h)
 }
 
-/// The object before a backdrop, with its soft edge.
-fn separate(image: &RgbaImage, found: &Backdrop) -> (RgbaImage, [u8; 3]) {
-    let (w, h) = image.dimensions();
-    let index = |x: u32, y: u32| y as usize * w as usize + x as usize;
-    let (background, mut depth) = (found.color, found.depth.clone());
-    let window = |x: u32, y: u32, r: u32| {
-        let (xs, ys) = (x.saturating_sub(r)..=(x + r).min(w - 1), y.saturating_sub(r)..=(y + r).min(h - 1));
-        ys.flat_map(move |y| xs.clone().map(move |x| (x, y)))
-    };
-    for ring in 1..=EDGE {
-        for y in 0..h {
-            for x in 0..w {
-                if depth[index(x, y)] == u8::MAX && window(x, y, 1).any(|(x, y)| depth[index(x, y)] == ring - 1) {
-                    depth[index(x, y)] = ring;
+impl Backdrop {
+    /// The object before it, with its soft edge. `image`: the one that it was found in.
+    pub(crate) fn separate(&self, image: &RgbaImage) -> RgbaImage {
+        let (w, h) = image.dimensions();
+        let index = |x: u32, y: u32| y as usize * w as usize + x as usize;
+        let (background, mut depth) = (self.color, self.depth.clone());
+        let window = |x: u32, y: u32, r: u32| {
+            let (xs, ys) = (x.saturating_sub(r)..=(x + r).min(w - 1), y.saturating_sub(r)..=(y + r).min(h - 1));
+            ys.flat_map(move |y| xs.clone().map(move |x| (x, y)))
+        };
+        for ring in 1..=EDGE {
+            for y in 0..h {
+                for x in 0..w {
+                    if depth[index(x, y)] == u8::MAX && window(x, y, 1).any(|(x, y)| depth[index(x, y)] == ring - 1) {
+                        depth[index(x, y)] = ring;
+                    }
                 }
             }
         }
-    }
 
-    let mut out = image.clone();
-    for (x, y, p) in out.enumerate_pixels_mut() {
-        match depth[index(x, y)] {
-            0 => *p = Rgba([0; 4]),
-            u8::MAX => p[3] = 255,
-            _ => {
-                let inside = window(x, y, u32::from(EDGE) + 1).filter(|&(x, y)| depth[index(x, y)] == u8::MAX);
-                *p = unmix(*p, background, inside.map(|(x, y)| image.get_pixel(x, y)));
+        let mut out = image.clone();
+        for (x, y, p) in out.enumerate_pixels_mut() {
+            match depth[index(x, y)] {
+                0 => *p = Rgba([0; 4]),
+                u8::MAX => p[3] = 255,
+                _ => {
+                    let inside = window(x, y, u32::from(EDGE) + 1).filter(|&(x, y)| depth[index(x, y)] == u8::MAX);
+                    *p = unmix(*p, background, inside.map(|(x, y)| image.get_pixel(x, y)));
+                }
             }
         }
+        out
     }
-    (out, background)
 }
 
 /// Splits a pixel into `alpha object + (1 - alpha) background`, with the object's color taken from its neighbors.
