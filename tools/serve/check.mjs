@@ -125,8 +125,8 @@ try {
   const dropped = async (file) => {
     for (const type of ["dragEnter", "dragOver", "drop"]) await send("Input.dispatchDragEvent", { type, x, y, data: { items: [], files: [file], dragOperationsMask: 1 } });
   };
-  for (const [name, size, words] of [["large", 513 * 2 ** 20, "takes at most 512 MB"], ["one", 65 * 2 ** 20, "takes at most 64 MB a file"], ["phone", 1, "HEIC files"]]) {
-    const place = join(folder, name), file = join(place, name === "phone" ? "a.heic" : "a.png");
+  for (const [name, size, words, named = "a.png"] of [["large", 513 * 2 ** 20, "takes at most 512 MB"], ["one", 65 * 2 ** 20, "takes at most 64 MB a file"], ["phone", 1, "HEIC files", "a.heic"], ["notes", 1, "no photo and no file of Gaussians", "a.txt"]]) {
+    const place = join(folder, name), file = join(place, named);
     mkdirSync(place);
     writeFileSync(file, "");
     truncateSync(file, size);
@@ -156,10 +156,34 @@ try {
   check("a dropped folder", title === "bowl", title);
   await accessible("with photos");
   await picture("understood");
+  // The first view has all cameras; without them the object is larger.
+  const eyes = JSON.parse(await get(`/jobs/${await evaluate("location.hash.slice(5)")}`)).understood.views
+    .map(({ camera: { world_to_camera: m } }) => [0, 1, 2].map((i) => -(m[4 * i] * m[12] + m[4 * i + 1] * m[13] + m[4 * i + 2] * m[14])));
+  const distance = () => evaluate("window.viewers[0].orbit.distance"), far = await distance();
+  const inSight = await evaluate(`(() => {
+    const [viewer] = window.viewers, { right, down, forward, eye } = viewer.pose(), { focal, middle } = viewer.lens(viewer.size());
+    return ${JSON.stringify(eyes)}.filter((e) => {
+      const along = (axis) => axis.reduce((sum, v, i) => sum + v * (e[i] - eye[i]), 0);
+      return along(forward) > 0 && [right, down].every((axis, i) => Math.abs(focal[i] * along(axis) / along(forward)) < middle[i]);
+    }).length;
+  })()`);
+  check("cameras in sight", inSight === 4, `${inSight} of 4`);
+  await click("#show-cameras");
+  check("the object without cameras", await distance() < 0.7 * far, `${await distance()} after ${far}`);
+  await click("#show-cameras");
 
-  // Photos without cameras: they are looked for, and the engine's refusal is told.
+  // Photos without cameras, where nothing finds them: what to do is said, and its field is shown.
   const shared = await evaluate("location.hash"), bare = join(folder, "bare");
   cpSync(join(bowl, "train"), bare, { recursive: true });
+  const finder = (found) => evaluate(`import("/send.js").then(({ tellServer }) => import("/state.js").then(({ app }) => { Object.assign(app, { finder: ${JSON.stringify(found)}, defaults: {} }); tellServer(); }))`);
+  await finder({ missing: "nobody here finds cameras" });
+  await dropped(bare);
+  await until("document.getElementById('alert').textContent.includes('nobody here finds cameras')");
+  check("nothing finds cameras", await evaluate("document.getElementById('reading').open && document.getElementById('bare').hidden"), await evaluate("document.getElementById('alert').textContent"));
+  await accessible("where nothing finds cameras");
+  await evaluate("document.getElementById('reading').open = false");
+  await finder({ name: "pycolmap 0.0-test" });
+  // They are looked for, and the engine's refusal is told.
   check("what finds cameras is said", await evaluate("document.getElementById('finder').textContent.includes('pycolmap 0.0-test')"), await evaluate("document.getElementById('finder').textContent"));
   await dropped(bare);
   await until("document.getElementById('cameras-dialog').open");
@@ -178,6 +202,8 @@ try {
   await state("failed", 60);
   const refusal = await evaluate("document.getElementById('status').textContent");
   check("a refusal of the engine", refusal.includes("only 0 of 4 photos could be placed") && !refusal.includes("--"), refusal);
+  await until("document.querySelector('#jobs a[aria-current]')?.title.includes('only 0 of 4 photos')");
+  check("a failed job's card", await evaluate("!document.querySelector('#jobs a[aria-current] img')"), "the reason, and no picture");
   await accessible("failed");
   await picture("failed");
   await evaluate(`location.hash = ${JSON.stringify(shared)}`);
@@ -305,8 +331,8 @@ try {
   const seen = new Set();
   let shot = false, more = "";
   while (await evaluate("document.body.dataset.state !== 'done' && document.body.dataset.state !== 'failed'")) {
-    more ||= await evaluate("/about \\d+ (s|min) left/.exec(document.getElementById('status').textContent)?.[0] ?? ''");
-    seen.add(`${await evaluate("document.body.dataset.state === 'running' ? document.getElementById('status').textContent.split(':')[0] : ''")} ${await evaluate(SUM)}`);
+    more ||= await evaluate("/about \\d+ (s|min) left in this step/.exec(document.getElementById('status').textContent)?.[0] ?? ''");
+    seen.add(`${await evaluate("document.body.dataset.state === 'running' ? document.getElementById('status').textContent.split(',')[0] : ''")} ${await evaluate(SUM)}`);
     if (!shot && seen.size > 6) {
       await picture("running");
       shot = true;
@@ -314,6 +340,7 @@ try {
     await wait(30);
   }
   const stages = [...new Set([...seen].map((s) => s.slice(0, s.lastIndexOf(" "))))].filter(Boolean);
+  check("steps are counted", stages.every((stage) => stage === "Starting." || /^Step [1-5] of 5: /.test(stage)), stages[0]);
   check("different estimates", seen.size >= 5, `${seen.size}, in ${stages.join(", ")}`);
   check("time left", more !== "", more || "never told");
   await state("done", 1);
@@ -369,6 +396,12 @@ try {
   const all = await evaluate("window.viewers[0].count");
   await evaluate("(() => { const to = document.getElementById('to-2'); to.value = 50; to.dispatchEvent(new Event('input')); })()");
   const half = await evaluate("window.viewers[0].count");
+  const places = await evaluate("[...document.querySelectorAll('#crop label')].map((l) => l.textContent)");
+  check("where the box is", places.length === 6 && places.every((text) => /^[xyz] (from|to) -?[\d.]+/.test(text)), places.join(", "));
+  await send("Emulation.setDeviceMetricsOverride", { width: 1280, height: 900, deviceScaleFactor: 1, mobile: false });
+  const needed = await evaluate("document.querySelector('.stage').getBoundingClientRect().bottom - document.getElementById('edit').getBoundingClientRect().top");
+  check("sliders and view on one screen", needed < 900, `${needed} of 900 px`);
+  await send("Emulation.setDeviceMetricsOverride", { width: 1100, height: 850, deviceScaleFactor: 1, mobile: false });
   await accessible("with a box");
   await picture("crop");
   await click("#edit-crop");
@@ -461,7 +494,7 @@ try {
   // A reload finds the job again.
   await chromium.open(`${url}/#job=${id}`);
   await until(`document.body.dataset.result === ${JSON.stringify(id)}`);
-  check("reload", true, await evaluate("document.getElementById('status').textContent"));
+  check("reload", (await evaluate("document.getElementById('status').textContent")).startsWith("Done in "), await evaluate("document.getElementById('status').textContent"));
 
   // Its address in another browser, which does not know the token: after the login it leads to the same object.
   await click("#link");
@@ -473,6 +506,13 @@ try {
   await evaluate(`document.getElementById('token').value = ${JSON.stringify(token)}; document.querySelector('form').submit()`);
   await until(`document.body.dataset.result === ${JSON.stringify(id)}`);
   check("the address in another browser", await evaluate("location.hash") === new URL(address).hash, address);
+
+  // Cancelled, a job has its earlier result.
+  await go();
+  await click("#cancel");
+  await state("cancelled", 10);
+  await until("document.getElementById('status').textContent.includes('earlier result is kept') && !document.getElementById('result').hidden");
+  check("a second run is cancelled", true, await evaluate("document.getElementById('status').textContent"));
 
   // Several samples, and where they differ.
   await evaluate("Object.assign(document.getElementById('samples'), { value: 2 }); Object.assign(document.getElementById('iterations'), { value: 60 }); document.getElementById('init').value = 'flow'");
@@ -505,6 +545,8 @@ try {
   await chromium.open(`${url}/?token=${token}#job=${id}`);
   await state("interrupted", 30);
   check("kill -9 and start again", true, await evaluate("document.getElementById('status').textContent"));
+  const settings = await evaluate("['samples', 'seed', 'iterations'].map((id) => document.getElementById(id).value).join()");
+  check("the form has the job's settings", settings === "2,0,60", settings);
   await picture("interrupted");
 
   // A file of Gaussians is shown, and offered in every format.
@@ -512,6 +554,7 @@ try {
   const one = { items: [], files: [ply], dragOperationsMask: 1 };
   for (const type of ["dragEnter", "dragOver", "drop"]) await send("Input.dispatchDragEvent", { type, x, y, data: one });
   await until(`location.hash.slice(5) !== ${JSON.stringify(id)} && document.body.dataset.result === location.hash.slice(5) && window.viewers[0]?.count === ${all}`, 60);
+  check("a file has its name, and no photos", await evaluate("document.getElementById('job-title').textContent === 'gaussians.ply' && document.getElementById('photos-title').hidden"), await evaluate("document.getElementById('job-title').textContent"));
   check("no seed of a file", !(await evaluate("document.getElementById('result').textContent + document.querySelector('#views').textContent")).match(/seed/i), await evaluate("document.querySelector('figcaption').textContent"));
   check("a dropped file of Gaussians", await evaluate("document.querySelectorAll('#downloads a').length") === job.formats.length, await evaluate("document.getElementById('notes').textContent"));
   await accessible("with a file of Gaussians");

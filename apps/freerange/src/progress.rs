@@ -59,3 +59,27 @@ impl Progress {
         self.bar.finish_and_clear();
     }
 }
+
+/// A task of one piece, whose end is not known before: on a terminal the time since it began, in a log one line.
+pub struct Waiting(ProgressBar);
+
+impl Waiting {
+    /// Begins; `about` says how long it may take.
+    pub fn new(label: &str, about: &str) -> Self {
+        let bar = ProgressBar::new_spinner().with_prefix(label.to_owned()).with_message(about.to_owned());
+        let style = ProgressStyle::with_template("{prefix:>12} {elapsed_precise} {msg}").expect("a valid template");
+        bar.set_style(style);
+        match bar.is_hidden() {
+            true => eprintln!("{label}: {about}"),
+            false => bar.enable_steady_tick(Duration::from_secs(1)),
+        }
+        Self(bar)
+    }
+}
+
+impl Drop for Waiting {
+    /// The task is over, well or not: the line goes away.
+    fn drop(&mut self) {
+        self.0.finish_and_clear();
+    }
+}

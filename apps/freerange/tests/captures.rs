@@ -153,6 +153,21 @@ fn warnings_of_inspect_are_told_and_kept() {
     holds(&masked, "understood", "masks are read from files, those of the folder masks");
 }
 
+#[test]
+fn inspect_names_views_as_its_sheet_does() {
+    let folder = tempfile::tempdir().unwrap();
+    let (scene, out) = (folder.path().join("scene"), folder.path().join("inspect"));
+    bowl(&scene, 1.0, [0.0; 3]);
+    let done = freerange(&["inspect", scene.to_str().unwrap(), "-o", out.to_str().unwrap(), "--views", "2"]);
+    let said = String::from_utf8_lossy(&done.stdout).into_owned();
+    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    assert!(said.contains("4 photos, 2 seen by the network"), "{said}");
+    assert_eq!(said.lines().filter(|line| line.ends_with(", for the optimization")).count(), 2, "{said}");
+    let json: Value = serde_json::from_slice(&fs::read(out.join("inspect.json")).unwrap()).unwrap();
+    let shown: Vec<&Value> = json["views"].as_array().unwrap().iter().filter(|v| v["shown"] == true).collect();
+    assert_eq!(shown.len(), 2);
+}
+
 /// A ring of photos of a striped ball, whose file is `NN.png`.
 fn ring(count: usize) -> Vec<View> {
     (0..count)

@@ -334,7 +334,7 @@ fn an_interrupted_result_leaves_nothing() {
     let place = tempfile::tempdir().unwrap();
     let out = place.path().join("out");
     std::fs::create_dir(&out).unwrap();
-    std::fs::write(out.join("gaussians.ply"), "old").unwrap();
+    ["gaussians.ply", "report.json"].iter().for_each(|name| std::fs::write(out.join(name), "old").unwrap());
     let mut child = Command::new(env!("CARGO_BIN_EXE_freerange"))
         .args(["reconstruct".as_ref(), example().as_os_str(), "-o".as_ref(), out.as_os_str()])
         .stderr(std::process::Stdio::null())
@@ -353,7 +353,7 @@ fn an_interrupted_result_leaves_nothing() {
     assert!(asked.success());
     assert_eq!(child.wait().unwrap().code(), Some(130));
     assert_eq!(names(), ["out"]);
-    assert_eq!(std::fs::read(out.join("gaussians.ply")).unwrap(), b"old");
+    ["gaussians.ply", "report.json"].iter().for_each(|name| assert_eq!(std::fs::read(out.join(name)).unwrap(), b"old"));
 }
 
 /// A limit on the size of files stands for a disk that fills up: the write fails in the middle of gaussians.ply.

@@ -86,7 +86,15 @@ fn what_cannot_be_converted_is_refused() {
         words.iter().for_each(|w| assert!(message.contains(w), "expected {w:?} in: {message}"));
         assert!(!message.contains("panicked") && !output.exists());
     };
-    refused(&source, &folder.path().join("out.fbx"), &[], &["out.fbx", ".spz", "found .fbx"]);
+    refused(&source, &folder.path().join("out.fbx"), &[], &["out.fbx", ".spz", "found .fbx", "--mesh writes .glb"]);
+    // One file, or none: what is missing is named as in the usage.
+    for files in [&[text(&source)][..], &[]] {
+        let done = freerange(&[&["convert"], files].concat());
+        let message = String::from_utf8_lossy(&done.stderr).into_owned();
+        assert!(done.status.code() == Some(2) && message.contains("<INPUT>... <OUTPUT>: expected files"), "{message}");
+        let found = files.first().map_or("found none".into(), |file| format!("found {file} alone"));
+        assert!(message.contains(&found), "{message}");
+    }
     refused(&folder.path().join("missing.glb"), &output, &[], &["missing.glb", "No such file"]);
     refused(&source, &output, &["--frame", "x-up"], &["expected z-up, y-up or y-down"]);
     for extension in ["ply", "splat", "spz", "sog", "glb", "usda", "usdz", "html"] {
@@ -142,6 +150,8 @@ fn convert_makes_meshes() {
         let done = freerange(&["convert", text(&bowl), text(&path), "--mesh", "--voxels", "40"]);
         assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
         assert!(String::from_utf8_lossy(&done.stdout).contains("triangles)") && path.metadata().unwrap().len() > 1000);
+        let said = String::from_utf8_lossy(&done.stderr).into_owned();
+        assert!(said.contains("meshing: takes some seconds") && !said.contains("--triangles"), "{said}");
     }
     let small = folder.path().join("small.glb");
     let run = |output: &Path, more: &[&str]| {
@@ -151,6 +161,7 @@ fn convert_makes_meshes() {
     };
     let (code, said) = run(&small, &["--triangles", "300", "--texture", "256"]);
     assert!(code == Some(0) && said.contains("(300 triangles)"), "{said}");
+    assert!(said.contains("meshing: takes a minute or more"), "{said}");
     for (name, more, words) in [
         ("m.spz", ["--triangles", "300"], "expected .glb, .ply or .obj, found .spz"),
         ("no.obj", ["--texture", "256"], "a texture: expected .glb, found .obj"),

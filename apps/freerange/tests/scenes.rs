@@ -124,6 +124,36 @@ fn many_scenes_are_made_once_and_a_bad_one_ends_none() {
     assert!(out.join("scenes-0-of-2.json").exists());
     let (_, rows, _) = made(&list, &out, &["--seed", "3", "--overwrite", "--shard", "1/2"]);
     assert_eq!(column(&rows, "scene"), ["empty"]);
+
+    // One scene alone into a folder of these: what is replaced is named, and the scene no longer counts as finished.
+    let (scene, folder) = (place.path().join("a/bowl"), out.join("a-bowl"));
+    let (scene, output) = (scene.to_str().unwrap(), folder.to_str().unwrap());
+    let quick = ["--set", "refine.passes=1", "--iterations", "0", "--symmetry", "off"];
+    let done = freerange(&[&["reconstruct", scene, "-o", output][..], &quick].concat());
+    let said = String::from_utf8_lossy(&done.stderr).into_owned();
+    let words = format!("note: {output} holds a result of {scene} (no preset, seed 3), made ");
+    assert!(done.status.success() && said.contains(&words), "{words}: {said}");
+    assert!(folder.join("gaussians.ply").exists() && !folder.join("scene.json").exists());
+}
+
+/// One scene is always computed. What lies in its folder is named first.
+#[test]
+fn a_scene_names_the_result_that_it_replaces() {
+    let place = tempfile::tempdir().unwrap();
+    let out = place.path().join("out");
+    let run = |more: &[&str]| {
+        let (scene, output) = (example(), out.to_str().unwrap());
+        let done = freerange(&[&["reconstruct", scene.to_str().unwrap(), "-o", output][..], more].concat());
+        let said = String::from_utf8_lossy(&done.stderr).into_owned();
+        assert!(done.status.success(), "{said}");
+        (said, fs::read(out.join("gaussians.ply")).unwrap())
+    };
+    let (said, draft) = run(&["--quality", "draft", "--seed", "3"]);
+    assert!(!said.contains("replaced"), "{said}");
+    let (said, quick) = run(&["--set", "refine.passes=1", "--iterations", "0", "--symmetry", "off"]);
+    let words = format!("{} holds a result of {} (draft, seed 3), made ", out.display(), example().display());
+    assert!(said.contains(&words) && said.contains(" ago: it is replaced when this one is done"), "{words}: {said}");
+    assert_ne!(draft, quick);
 }
 
 /// White beside white is as good as can be; it has no finite PSNR, which JSON would not hold.

@@ -3,7 +3,7 @@
 use std::{
     fs,
     io::{BufRead, BufReader, Read, Write},
-    net::TcpStream,
+    net::{TcpListener, TcpStream},
     process::{Child, Command, Stdio},
 };
 
@@ -110,4 +110,19 @@ fn what_is_not_safe_is_refused() {
         assert!(output.status.code() == Some(2) && text.contains(words), "{arguments:?}: {text}");
         assert!(!text.contains("hush"), "{text}");
     }
+}
+
+#[test]
+fn a_port_in_use_is_refused_with_a_way_out() {
+    let other = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = other.local_addr().unwrap();
+    let port = address.port().to_string();
+    let mut command = Command::new(env!("CARGO_BIN_EXE_freerange"));
+    let output = command.args(["serve", "--port", &port, "--device", "cpu", "--no-token"]).output().unwrap();
+    let text = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(2), "{text}");
+    assert!(
+        text.contains(&format!("cannot listen at {address}")) && text.contains("--port 0 takes a free port"),
+        "{text}"
+    );
 }

@@ -7,7 +7,7 @@ use freerange_gaussians::formats::{Format, Frame, Frames, SpzVersion, WriteOptio
 use freerange_optim::meshing::{MeshConfig, MeshFormat, mesh_of, save};
 use glam::{DQuat, DVec3};
 
-use crate::error::CliError;
+use crate::{error::CliError, progress::Waiting};
 
 /// Convert Gaussians between formats, by the extensions of the files; merge, crop, clean and scale them.
 ///
@@ -21,7 +21,7 @@ use crate::error::CliError;
 #[command(override_usage = "freerange convert [OPTIONS] <INPUT>... <OUTPUT>")]
 pub struct Args {
     /// One or more files to read (INPUT), then the file to write (OUTPUT).
-    #[arg(required = true, num_args = 2.., value_name = "FILE")]
+    #[arg(value_name = "FILE")]
     files: Vec<PathBuf>,
     /// Frame of formats that define none: z-up (this program), y-up or y-down [default: z-up, or what a .ply says].
     ///
@@ -89,12 +89,12 @@ fn parse_length(text: &str) -> Result<f64, String> {
 }
 
 pub fn run(args: &Args) -> Result<(), CliError> {
-    let Some((output, inputs)) = args.files.split_last() else { unreachable!("two files are required") };
+    let (inputs, output) = places(&args.files)?;
     // Before anything is read.
     if args.mesh {
         MeshFormat::with_texture(output, args.texture.is_some())?;
     } else {
-        Format::of(output)?;
+        Format::of(output).map_err(|e| CliError::input(format!("{e}; --mesh writes .glb, .ply or .obj")))?;
     }
     let (mut splats, frame) = merged(inputs, args.frame.unwrap_or_default())?;
     if let Some((a, b)) = args.r#box {
@@ -111,16 +111,45 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         eprintln!("note: scaled by {factor}");
     }
     if args.mesh {
-        let Args { voxels, triangles, texture, .. } = *args;
-        let shape = mesh_of(&splats, &MeshConfig { voxels, triangles, texture, ..MeshConfig::default() })?;
-        save(&shape, output, frame.to(Frame::Y_UP))?;
-        println!("{} ({} triangles)", output.display(), shape.triangles.len());
-        return Ok(());
+        return mesh(args, &splats, output, frame);
     }
     let notes = write(&splats, output, &WriteOptions { frame, spz_version: args.spz_version })?;
     notes.iter().for_each(|note| eprintln!("note: {note}"));
     println!("{} ({} Gaussians)", output.display(), splats.cloud.len());
     Ok(())
+}
+
+/// The files to read, and the one to write.
+fn places(files: &[PathBuf]) -> Result<(&[PathBuf], &Path), CliError> {
+    match files.split_last() {
+        Some((output, inputs)) if !inputs.is_empty() => Ok((inputs, output.as_path())),
+        other => {
+            let found = other.map_or("none".into(), |(file, _)| format!("{} alone", file.display()));
+            let expected = "expected files to read, then the file to write";
+            Err(CliError::input(format!("<INPUT>... <OUTPUT>: {expected}, found {found}")))
+        }
+    }
+}
+
+/// Triangles of a mesh above which a note says how to get fewer.
+const MANY: usize = 100_000;
+
+/// Writes a mesh of the Gaussians.
+fn mesh(args: &Args, splats: &Splats, output: &Path, frame: Frame) -> Result<(), CliError> {
+    let Args { voxels, triangles, texture, .. } = *args;
+    let slow = triangles.is_some() || texture.is_some();
+    let waiting = Waiting::new("meshing", if slow { "takes a minute or more" } else { "takes some seconds" });
+    let shape = mesh_of(splats, &MeshConfig { voxels, triangles, texture, ..MeshConfig::default() })?;
+    drop(waiting);
+    save(&shape, output, frame.to(Frame::Y_UP))?;
+    many(shape.triangles.len(), triangles).iter().for_each(|note| eprintln!("note: {note}"));
+    println!("{} ({} triangles)", output.display(), shape.triangles.len());
+    Ok(())
+}
+
+/// The note on a large mesh, if no number of triangles was `asked` for.
+fn many(found: usize, asked: Option<usize>) -> Option<String> {
+    (found > MANY && asked.is_none()).then(|| format!("{found} triangles; --triangles N makes fewer"))
 }
 
 /// All Gaussians of the files, in one frame.
@@ -146,4 +175,15 @@ fn kept(splats: &Splats, indices: &[usize], which: &str) -> Result<Splats, CliEr
     }
     eprintln!("note: {found} of {all} Gaussians are {which}, {} are left out", all - found);
     Ok(splats.select(indices))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_large_mesh_has_a_note() {
+        assert_eq!(many(263_304, None).as_deref(), Some("263304 triangles; --triangles N makes fewer"));
+        assert_eq!((many(100_000, None), many(263_304, Some(300_000))), (None, None));
+    }
 }

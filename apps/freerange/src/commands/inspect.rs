@@ -116,7 +116,7 @@ fn print(args: &Args, found: &Inspection) {
             100.0 * view.covers,
             100.0 * view.agreement,
             if view.cut_off { ", cut off" } else { "" },
-            if view.shown { "" } else { ", not shown" },
+            if view.shown { "" } else { ", for the optimization" },
         );
     }
     found.notes.iter().for_each(|note| println!("  {note}"));

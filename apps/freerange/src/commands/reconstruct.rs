@@ -2,6 +2,7 @@
 
 mod batch;
 mod holdout;
+mod replaced;
 mod written;
 
 use std::{
@@ -38,8 +39,10 @@ use written::{Place, Written, parse_written};
 /// Reconstruct an object from posed photos.
 ///
 /// Writes gaussians.ply in the frame of the cameras, turntable.gif, inputs/ (each photo beside its render) and report.json.
-/// Several scenes get a folder each, and scenes.json lists them. Finished scenes are skipped; a failing scene does not stop
-/// the others.
+/// One scene is always computed. An older result in the output folder is named, and replaced when the new one is done.
+///
+/// Several scenes get a folder each, and scenes.json lists them. Finished scenes are skipped there, and other options are
+/// refused unless --overwrite is given. A failing scene does not stop the others.
 #[derive(clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct Args {
@@ -81,7 +84,7 @@ pub struct Args {
     /// For arrays of jobs. Processes of mpirun or srun divide the scenes by themselves.
     #[arg(long, value_name = "I/N", value_parser = shard, hide_short_help = true, help_heading = "Many scenes")]
     shard: Option<(usize, usize)>,
-    /// Reconstruct finished scenes again.
+    /// Reconstruct finished scenes of several again; one scene is always reconstructed.
     #[arg(long, hide_short_help = true, help_heading = "Many scenes")]
     overwrite: bool,
 }
@@ -91,6 +94,10 @@ const EXAMPLES: &str = "Examples:
   freerange reconstruct photos --masks estimate             photos on a table, with COLMAP's cameras
   freerange reconstruct photos --holdout-every 8 --quality high
   freerange reconstruct a b c -o results                    three scenes and a table of them";
+
+/// The files of a result: its first sample, and what it says of itself.
+const GAUSSIANS: &str = "gaussians.ply";
+const REPORT: &str = "report.json";
 
 fn shard(text: &str) -> Result<(usize, usize), String> {
     let parts = text.split_once('/').and_then(|(i, n)| Some((i.parse().ok()?, n.parse().ok()?)));
@@ -228,7 +235,8 @@ fn run_in(args: &Args, job: &Job) -> Result<(), CliError> {
     args.pipeline.options(&model, args.samples)?;
     let program = Program::of(&model, args.pipeline.checkpoint_sha256()?);
     let scene = args.photos.load(args.photos.cameras(path)?, args.pipeline.up, KeepWhole::Small)?;
-    let (report, json) = reconstruct(args, path, scene, &model, &program, &args.output, begin, || Ok(()))?;
+    let (report, json) =
+        reconstruct(args, path, scene, &model, &program, &args.output, begin, || batch::replace(&args.output))?;
     match args.json {
         true => {
             tell(&report.notes);
@@ -282,6 +290,7 @@ fn reconstruct(
     let file = args.pipeline.init_file();
     options.init = file.map(|file| init(file, &inputs, &options.frame)).transpose()?;
     let output = OutputFolder::create("reconstruct", folder)?;
+    replaced::note(folder, model).iter().for_each(|note| eprintln!("note: {note}"));
     let mut seconds = vec![("load", begin.elapsed().as_secs_f64())];
 
     let mut watch = Watch::default();
@@ -317,7 +326,7 @@ fn reconstruct(
         peak_memory_bytes: peak_memory(),
     };
     let json = serde_json::to_string_pretty(&report).map_err(CliError::input)?;
-    output.write("report.json", json.as_bytes())?;
+    output.write(REPORT, json.as_bytes())?;
     commit()?;
     output.commit()?;
     Ok((report, json))
@@ -336,7 +345,7 @@ fn write_sample(
     notes: &mut Vec<Note>,
 ) -> Result<SampleReport, CliError> {
     let suffix = if i == 0 { String::new() } else { format!("-{i}") };
-    let file = format!("gaussians{suffix}.ply");
+    let file = if i == 0 { GAUSSIANS.to_owned() } else { format!("gaussians{suffix}.ply") };
     let splats = Splats { origin: origin.unwrap_or_default().into(), ..sample.gaussians.clone().into() };
     let options = WriteOptions { frame, ..WriteOptions::default() };
     freerange_gaussians::formats::write(&splats, &output.path(&file)?, &options)?;

@@ -5,7 +5,7 @@ mod cameras;
 use std::{
     env::VarError,
     fs::File,
-    io::{Read, Write},
+    io::{ErrorKind, Read, Write},
     net::{IpAddr, SocketAddr},
     ops::ControlFlow,
     path::PathBuf,
@@ -232,6 +232,9 @@ impl From<ServeError> for CliError {
     fn from(e: ServeError) -> Self {
         match e {
             ServeError::Folder(IoError { path, source }) => Self::file(&path, source),
+            ServeError::Listen { ref source, .. } if source.kind() == ErrorKind::AddrInUse => {
+                Self::input(format!("{e}; --port 0 takes a free port"))
+            }
             e => Self::input(e),
         }
     }
@@ -262,6 +265,21 @@ fn told(e: CliError) -> EngineError {
 impl Engine for Local {
     fn name(&self) -> String {
         self.name.clone()
+    }
+
+    fn defaults(&self) -> JobOptions {
+        let choices = self.pipeline.choices();
+        let quality = match choices.quality {
+            Quality::Draft => freerange_serve::Quality::Draft,
+            Quality::Default => freerange_serve::Quality::Default,
+            Quality::High => freerange_serve::Quality::High,
+        };
+        // Options that cannot be made are an error when a job runs.
+        let init = self.model.options_of(&choices).ok().map(|options| match options.pipeline.propose.init {
+            Init::Fit => freerange_serve::Init::Fit,
+            Init::Flow => freerange_serve::Init::Flow,
+        });
+        JobOptions { quality: Some(quality), init, ..JobOptions::default() }
     }
 
     fn choose(&self, views: &[View]) -> Result<Vec<usize>, String> {

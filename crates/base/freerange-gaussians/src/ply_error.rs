@@ -3,6 +3,9 @@
 use crate::{SplatError, ply_header::Element};
 use std::path::Path;
 
+/// What is found where rows are missing.
+pub(crate) const END: &str = "the end of the file: cut off or incomplete";
+
 /// The first few of `names`; headers may hold thousands.
 pub(crate) fn listed(names: &[&str]) -> String {
     let shown = names.iter().take(8).map(|n| n.chars().take(40).collect()).collect::<Vec<String>>().join(", ");

@@ -1,7 +1,7 @@
 //! The values of a `.ply` after its header, one by one, in ascii and both byte orders.
 
 use crate::SplatError;
-use crate::ply_error::value_error;
+use crate::ply_error::{END, value_error};
 use crate::ply_header::{Element, Format, Kind, Property, Scalar};
 use freerange_util::IoError;
 use std::io::{self, BufRead, Read};
@@ -77,7 +77,7 @@ impl<'a, R: BufRead> Values<'a, R> {
             return Err(match source.kind() {
                 io::ErrorKind::UnexpectedEof => {
                     let expected = format!("{} rows", element.count);
-                    value_error(self.file, element, row, &property.name, &expected, "the end of the file")
+                    value_error(self.file, element, row, &property.name, &expected, END)
                 }
                 _ => IoError::at(self.file)(source).into(),
             });
@@ -112,7 +112,7 @@ impl<'a, R: BufRead> Values<'a, R> {
                 Err(value_error(self.file, element, row, &element.properties[0].name, expected, found))
             };
             if read == 0 {
-                return fail(&format!("{} rows", element.count), "the end of the file");
+                return fail(&format!("{} rows", element.count), END);
             }
             if read as u64 == LINE_LIMIT {
                 return fail("a row", "a line too long");

@@ -223,6 +223,33 @@ fn pages() {
     has(&data("AAAA"), &["multiple of 56", "found 3"]);
 }
 
+/// Three quarters of a file, as an interrupted copy or download leaves it.
+#[test]
+fn files_that_are_cut_off_are_said_to_be() {
+    let versions = [SpzVersion::V3, SpzVersion::V4];
+    for (format, version) in Format::ALL.into_iter().flat_map(|f| versions.map(|v| (f, v))) {
+        let mut bytes = example(format, version);
+        let mut end = bytes.len() * 3 / 4;
+        if format == Format::Html {
+            // Most of a small page is the script after the Gaussians.
+            let mark: &[u8] = b"id=\"gaussians\"";
+            end = bytes.windows(mark.len()).position(|w| w == mark).unwrap() + 100;
+        }
+        bytes.truncate(end);
+        has(&try_all(format, &bytes).unwrap_err(), &["cut off"]);
+    }
+    // Before the Gaussians of a page; and the lengths of a .glb in their order.
+    has(&refused(Format::Html, |b| b.truncate(300)), &["another one, or the file is cut off"]);
+    let whole = example(Format::Glb, SpzVersion::V3).len();
+    let (claimed, longer) = (format!("expected {whole} bytes, as the header says"), format!("found {}", whole + 4));
+    has(&refused(Format::Glb, |b| b.truncate(500)), &[&claimed, "found 500: cut off or incomplete"]);
+    has(&refused(Format::Glb, |b| b.extend([0; 4])), &[&claimed, &longer]);
+    has(&try_all(Format::Glb, b"{\"scenes\": [").unwrap_err(), &["JSON", "cut off"]);
+    // What is damaged, but whole, is not.
+    let damaged = refused(Format::Sog, |b| b[..200].fill(7));
+    assert!(!damaged.contains("cut off"), "{damaged}");
+}
+
 fn formats() -> impl Strategy<Value = (Format, SpzVersion)> {
     let all = Format::ALL.into_iter().map(|f| (f, SpzVersion::V3));
     prop::sample::select(all.chain([(Format::Spz, SpzVersion::V4)]).collect::<Vec<_>>())

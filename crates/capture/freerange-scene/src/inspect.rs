@@ -220,6 +220,8 @@ fn warnings(views: &[ViewReport], sureness: Option<f64>) -> Vec<String> {
 /// Width and height of a picture on the sheet.
 const TILE: u32 = 360;
 const LINE: u32 = 12;
+/// Between a label and the photo below it.
+const GAP: u32 = 4;
 const GREEN: Rgba<u8> = Rgba([40, 200, 60, 255]);
 const GRAY: Rgba<u8> = Rgba([120, 120, 120, 255]);
 const ORANGE: Rgba<u8> = Rgba([255, 150, 0, 255]);
@@ -259,7 +261,7 @@ pub fn sheet(loaded: &Loaded, inspection: &Inspection) -> Result<RgbaImage, Scen
         let place = i as u32 + 1;
         let (x, y) = (place % columns * TILE, head + place / columns * (TILE + 2 * LINE));
         let picture = tile(view, loaded.whole.get(i)?.as_ref(), report, center, radius);
-        image::imageops::overlay(&mut sheet, &picture, i64::from(x), i64::from(y + LINE));
+        image::imageops::overlay(&mut sheet, &picture, i64::from(x), i64::from(y + LINE + GAP));
         let ink = if report.doubtful() || report.cut_off { RED } else { INK };
         let line = format!(
             "{place} {}: {} AGREES {:.0} %{}",
@@ -373,7 +375,7 @@ fn text(sheet: &mut RgbaImage, x: u32, y: u32, line: &str, ink: Rgba<u8>) {
             ',' => "00024",
             '-' => "00700",
             '_' => "00007",
-            '%' => "51245",
+            '%' => "41241",
             ':' => "02020",
             '(' => "12221",
             ')' => "42224",

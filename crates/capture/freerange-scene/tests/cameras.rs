@@ -172,6 +172,16 @@ fn lenses_agree_with_opencv_and_can_be_inverted() {
 }
 
 #[test]
+fn a_file_that_is_none_of_cameras_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["notes.txt", "camera.bin"] {
+        let path = folder.path().join(name);
+        std::fs::write(&path, "bread and milk").unwrap();
+        says(cameras(&path, None, None), &[name, "a folder"]);
+    }
+}
+
+#[test]
 fn broken_colmap_files_are_refused() {
     let file = Path::new("x.bin");
     let read = |name: &str| std::fs::read(golden("OPENCV").join(name)).unwrap();

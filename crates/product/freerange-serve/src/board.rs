@@ -25,7 +25,7 @@ use freerange_util::IoError;
 use self::table::{Job, Table};
 pub use self::{arriving::Submission, results::Held};
 use crate::{
-    Engine, Limits, Refusal, ServeError,
+    Engine, JobOptions, Limits, Refusal, ServeError,
     disk::size_of,
     metrics::Metrics,
     record::{Record, State},
@@ -149,6 +149,16 @@ impl Board {
         self.engine.name()
     }
 
+    pub fn defaults(&self) -> JobOptions {
+        self.engine.defaults()
+    }
+
+    /// The options of a job that goes: what they leave out is recorded, as far as it is known. Another server may have other defaults.
+    fn complete(&self, options: JobOptions) -> JobOptions {
+        let known = self.defaults();
+        JobOptions { quality: options.quality.or(known.quality), init: options.init.or(known.init), ..options }
+    }
+
     pub fn camera_finder(&self) -> Result<String, String> {
         self.engine.camera_finder()
     }
@@ -175,7 +185,7 @@ impl Board {
             let result = change(job)?;
             (result, std::mem::replace(&mut job.record, before), job.folder.clone(), was)
         };
-        let written = record.write(&folder).map_err(Refusal::own);
+        let written = record.write(&folder).map_err(Refusal::file(&crate::record::file(&folder)));
         let over = matches!(record.state, State::Failed | State::Cancelled | State::Interrupted);
         if let Err(e) = &written
             && record.state != was
@@ -248,7 +258,7 @@ mod tests {
     use image::RgbaImage;
 
     use super::*;
-    use crate::{EngineError, FoundCameras, JobOptions, Outcome, Scene, Search, SearchStep, Step, scene::SceneOptions};
+    use crate::{EngineError, FoundCameras, Outcome, Scene, Search, SearchStep, Step, scene::SceneOptions};
 
     /// Computes nothing.
     struct Idle;

@@ -14,6 +14,11 @@ pub trait Engine: Send + Sync + 'static {
     /// The model and where it computes, for people.
     fn name(&self) -> String;
 
+    /// What jobs have where they choose nothing, as far as it is known: for people.
+    fn defaults(&self) -> JobOptions {
+        JobOptions::default()
+    }
+
     /// Which of the views the model would be shown, ascending.
     ///
     /// # Errors

@@ -1,5 +1,7 @@
 //! Why the server cannot start.
 
+use std::path::Path;
+
 use freerange_util::{Invalid, IoError};
 
 use crate::disk::is_full;
@@ -47,6 +49,12 @@ impl Refusal {
             false => Self::new(500, "the server failed; its log says why"),
         }
     }
+
+    /// The same for a file of a job: with its name, and without the folders that it lies in.
+    pub(crate) fn file<E: std::fmt::Display>(path: &Path) -> impl FnOnce(E) -> Self {
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        move |e| Self::own(format!("{name}: {e}"))
+    }
 }
 
 /// A cause and all that lies beneath it.
@@ -66,5 +74,7 @@ mod tests {
             assert_eq!(refusal, Refusal::new(507, "the server's disk is full"));
         }
         assert_eq!(Refusal::own(std::io::Error::from_raw_os_error(2)).status, 500);
+        let named = Refusal::file::<std::io::Error>(Path::new("/srv/keep/ID/job.json"))(full());
+        assert_eq!(named, Refusal::new(507, "the server's disk is full"));
     }
 }

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 /// What other crates advise, and what the page says instead.
-const WORDS: [(&str, &str); 23] = [
+const WORDS: [(&str, &str); 24] = [
     ("; --invert-masks if black is the object", "; tick \u{201c}In mask files black is the object\u{201d} if it is"),
     (" (--masks FOLDER if they do)", ""),
     (" (--masks alpha if it is)", " (choose \u{201c}alpha\u{201d} under Masks if it is)"),
@@ -21,6 +21,10 @@ const WORDS: [(&str, &str); 23] = [
     ("(--uneven if they did)", "(tick \u{201c}not at even steps\u{201d} if they did)"),
     ("; if the poses are right, say where the object is (--center X,Y,Z)", ""),
     ("; say where the object is (--center X,Y,Z)", ""),
+    (
+        "; photos without cameras: `freerange poses PHOTOS -o SCENE` finds them with COLMAP",
+        "; for photos without cameras send the photos alone",
+    ),
     ("; on a turntable in even steps: --turntable ELEVATION,FOV", "; on a turntable in even steps: fill in Turntable"),
     ("turntables have --turntable ELEVATION,FOV", "turntables have the field Turntable"),
     ("; --images FOLDER says where else)", ")"),
@@ -117,11 +121,12 @@ mod tests {
         // What is said of cameras that were found.
         let judge = "/../../../apps/freerange/src/commands/poses/judge.rs";
         found.push(std::fs::read_to_string([env!("CARGO_MANIFEST_DIR"), judge].concat()).unwrap());
-        let with: Vec<String> = found.iter().flat_map(|s| literals(s)).filter(|l| l.contains("--")).collect();
+        let of_shells = |text: &str| text.contains("--") || text.contains("`freerange ");
+        let with: Vec<String> = found.iter().flat_map(|s| literals(s)).filter(|l| of_shells(l)).collect();
         assert!(with.len() >= 15, "{with:?}");
         for literal in with {
             let shown = sentence(&literal, Path::new("x"));
-            assert!(!shown.contains("--"), "{literal:?} is shown as {shown:?}: the page has no options");
+            assert!(!of_shells(&shown), "{literal:?} is shown as {shown:?}: the page has no options and no commands");
         }
     }
 }

@@ -28,6 +28,9 @@ const TEXT: u64 = 64 << 10;
 const MASK: u64 = 16 << 20;
 /// Most Gaussians that a client may choose among, a byte each.
 const KEPT: u64 = 16 << 20;
+/// What is said where there is nothing to read.
+const NOTHING: &str = "no photo and no file of Gaussians was sent: expected photos (JPEG, PNG or WebP) with their cameras, or one file of \
+                       Gaussians (.ply, .splat, .spz, .sog, .glb, .usda, .usdz or .html)";
 /// Most photos a client may number.
 const PHOTOS: usize = 10_000;
 /// A stream without news says so after this time, so that it is noticed when a client has gone.
@@ -55,7 +58,9 @@ pub fn serve(site: &Site, mut request: Request) {
     if head_only {
         request.method = "GET".into();
     }
-    let response = answer(site, &mut request).unwrap_or_else(|e| refused(&e));
+    // Errors in the log name it.
+    let span = tracing::error_span!("request", method = %request.method, path = ?request.path);
+    let response = span.in_scope(|| answer(site, &mut request)).unwrap_or_else(|e| refused(&e));
     site.board.metrics.answered(response.status);
     let limits = site.board.limits();
     // A stream ends by itself; its last event may take a moment.
@@ -208,6 +213,7 @@ fn server(site: &Site) -> Response {
     Response::json(&json!({
         "version": env!("CARGO_PKG_VERSION"),
         "engine": site.board.engine_name(),
+        "defaults": site.board.defaults(),
         "example": site.example.map(|e| e.name),
         "camera_finder": match site.board.camera_finder() {
             Ok(name) => json!({ "name": name }),
@@ -274,9 +280,7 @@ fn post(site: &Site, request: &mut Request) -> Answer {
         options.check().map_err(|e| Refusal::new(422, e))?;
     }
     match (example, &site.example) {
-        (None, _) if upload.title.is_none() => {
-            return Err(Refusal::new(422, "expected files of photos and cameras, or one of Gaussians, found none"));
-        }
+        (None, _) if !upload.is_of_use() => return Err(Refusal::new(422, NOTHING)),
         (None, _) => {}
         (Some(_), _) if upload.title.is_some() => {
             return Err(Refusal::new(422, "expected files or the example, found both"));

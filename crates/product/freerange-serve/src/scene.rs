@@ -136,7 +136,7 @@ fn save(picture: &RgbaImage, path: &Path) -> Result<(), Refusal> {
     );
     picture.write_with_encoder(fast).map_err(Refusal::own)?;
     // At once: a buffer that is dropped does not report a full disk.
-    fs::write(path, bytes).map_err(Refusal::own)
+    fs::write(path, bytes).map_err(Refusal::file(path))
 }
 
 /// Photos of a client, and what is made of them.
@@ -281,12 +281,12 @@ pub fn root(upload: &Path) -> std::io::Result<PathBuf> {
 }
 
 fn kept(folder: &Path) -> Result<Kept, Refusal> {
-    let bytes = fs::read(scene_file(folder)).map_err(Refusal::own)?;
+    let bytes = fs::read(scene_file(folder)).map_err(Refusal::file(&scene_file(folder)))?;
     serde_json::from_slice(&bytes).map_err(Refusal::own)
 }
 
 fn picture(path: &Path) -> Result<RgbaImage, Refusal> {
-    Ok(image::open(path).map_err(Refusal::own)?.into_rgba8())
+    Ok(image::open(path).map_err(Refusal::file(path))?.into_rgba8())
 }
 
 /// What [`prepare`] wrote, to the bit.
@@ -324,7 +324,7 @@ pub fn edit_mask(folder: &Path, k: usize, png: &[u8]) -> Result<f64, Refusal> {
     }
     let beside = folder.join("edited.png");
     save(&view, &beside)?;
-    fs::rename(&beside, &path).map_err(Refusal::own)?;
+    fs::rename(&beside, &path).map_err(Refusal::file(&path))?;
     Ok(covered as f64 / mask.pixels().len() as f64)
 }
 

@@ -7,7 +7,7 @@ use freerange_gaussians::{
     formats::{Format, Frame, Frames, Loaded, WriteOptions, encode, parse},
 };
 use freerange_scene::camera::{Camera, Up};
-use freerange_util::write_atomically;
+use freerange_util::{Stop, write_atomically};
 use glam::DVec3;
 use image::RgbaImage;
 use serde_json::{Value, json};
@@ -34,12 +34,13 @@ fn memory_per_byte(format: Format) -> u64 {
     }
 }
 
-/// Reads the Gaussians of `file`, and writes them as the first sample of the job in `folder`. `up` overrides what the file says.
-pub fn prepare(file: &Path, folder: &Path, up: Option<Up>, limits: &Limits) -> Result<Found, Refusal> {
+/// Reads the Gaussians of `file`, and writes them as the first sample of the job in `folder`, unless `stop` says otherwise by then. `up`
+/// overrides what the file says.
+pub fn prepare(file: &Path, folder: &Path, up: Option<Up>, limits: &Limits, stop: &Stop) -> Result<Found, Refusal> {
     let beside = file.parent().unwrap_or(folder);
     let refused = |text: &str| Refusal::new(422, plain::sentence(text, beside));
     let format = Format::of_input(file).map_err(|e| refused(&chain(&e)))?;
-    let bytes = fs::metadata(file).map_err(Refusal::own)?.len();
+    let bytes = fs::metadata(file).map_err(Refusal::file(file))?.len();
     let [needed, most] = [bytes.saturating_mul(memory_per_byte(format)), limits.memory].map(|b| b.div_ceil(1 << 20));
     if needed > most {
         let text = format!("a file of Gaussians of this size may take {needed} MB of memory: {most} MB is the limit");
@@ -53,7 +54,7 @@ pub fn prepare(file: &Path, folder: &Path, up: Option<Up>, limits: &Limits) -> R
     };
     let frames = Frames { from: chosen, to: chosen };
     // From the bytes alone: whatever else the file names is not looked for.
-    let bytes = fs::read(file).map_err(Refusal::own)?;
+    let bytes = fs::read(file).map_err(Refusal::file(file))?;
     let name = Path::new(file.file_name().unwrap_or_default());
     let Loaded { splats, frame, notes } = parse(format, &bytes, name, frames).map_err(|e| refused(&chain(&e)))?;
     if splats.cloud.is_empty() {
@@ -61,8 +62,10 @@ pub fn prepare(file: &Path, folder: &Path, up: Option<Up>, limits: &Limits) -> R
     }
     let options = WriteOptions { frame, ..WriteOptions::default() };
     let encoded = encode(&splats, Format::Ply, &options).map_err(|e| refused(&chain(&e)))?;
-    write_atomically(&sample_file(folder, 0), |w| std::io::Write::write_all(w, &encoded.bytes))
-        .map_err(Refusal::own)?;
+    // Who cancelled a job may have removed it since: its folder is elsewhere then.
+    stop.check().map_err(|_| Refusal::new(409, "cancelled"))?;
+    let sample = sample_file(folder, 0);
+    write_atomically(&sample, |w| std::io::Write::write_all(w, &encoded.bytes)).map_err(Refusal::file(&sample))?;
     let (center, radius) = place(&splats.cloud);
     let up = frame.up();
     let notes: Vec<String> = notes.iter().map(|note| plain::sentence(note, beside)).collect();
@@ -92,6 +95,6 @@ fn place(cloud: &Gaussians) -> (DVec3, f64) {
 pub fn thumbnail(engine: &dyn crate::Engine, found: &Found) -> RgbaImage {
     engine.picture(&found.cloud, &found.camera).unwrap_or_else(|e| {
         tracing::warn!("no picture of the Gaussians: {e}");
-        RgbaImage::from_pixel(1, 1, image::Rgba([255; 4]))
+        RgbaImage::new(1, 1)
     })
 }

@@ -28,8 +28,7 @@ pub struct Upload<'a> {
     folder: &'a Path,
     limits: &'a Limits,
     files: usize,
-    /// Photos and files of cameras.
-    of_scenes: usize,
+    photos: usize,
     /// Files of Gaussians, and the clients' names of them.
     splats: Vec<(PathBuf, String)>,
     pixels: u64,
@@ -37,7 +36,7 @@ pub struct Upload<'a> {
     pub bytes: u64,
     /// Files that are of no use here.
     pub passed_over: Vec<String>,
-    /// The first folder of all names, or the first file.
+    /// The first folder of all names, or the first file: its whole name if that is one of Gaussians.
     pub title: Option<String>,
 }
 
@@ -97,7 +96,7 @@ impl<'a> Upload<'a> {
             folder,
             limits,
             files: 0,
-            of_scenes: 0,
+            photos: 0,
             splats: Vec::new(),
             pixels: 0,
             bytes: 0,
@@ -124,7 +123,8 @@ impl<'a> Upload<'a> {
             while read(&mut chunk)? > 0 {}
             return Ok(());
         }
-        let title = || shown(parts[0].rsplit_once('.').filter(|_| parts.len() == 1).map_or(parts[0], |(stem, _)| stem));
+        let stem = parts[0].rsplit_once('.').filter(|_| parts.len() == 1 && !matches!(kind, Kind::Splats));
+        let title = || shown(stem.map_or(parts[0], |(stem, _)| stem));
         self.title.get_or_insert_with(title);
         let path = parts.iter().fold(self.folder.to_path_buf(), |path, part| path.join(part));
         fs::create_dir_all(path.parent().unwrap_or(self.folder)).map_err(Refusal::own)?;
@@ -157,12 +157,15 @@ impl<'a> Upload<'a> {
         writer.flush().map_err(Refusal::own)?;
         drop(writer);
         match kind {
-            Kind::Splats => self.splats.push((path.clone(), shown(name))),
-            _ => self.of_scenes += 1,
-        }
-        match kind {
-            Kind::Picture => self.picture(&path, name),
+            Kind::Picture => {
+                self.photos += 1;
+                self.picture(&path, name)
+            }
             Kind::Cameras if is_json => json(&path, name),
+            Kind::Splats => {
+                self.splats.push((path, shown(name)));
+                Ok(())
+            }
             _ => Ok(()),
         }
     }
@@ -173,10 +176,15 @@ impl<'a> Upload<'a> {
         }
     }
 
-    /// The file of Gaussians, where that is all there is. Beside photos and cameras such files are of no use, and go.
+    /// Whether there is something to read: a photo, or Gaussians.
+    pub fn is_of_use(&self) -> bool {
+        self.photos > 0 || !self.splats.is_empty()
+    }
+
+    /// The file of Gaussians, where there are no photos. Beside photos such files are of no use, and go.
     pub fn only_splats(&mut self) -> Result<Option<PathBuf>, Refusal> {
         let mut splats = std::mem::take(&mut self.splats);
-        if self.of_scenes > 0 {
+        if self.photos > 0 {
             for (path, name) in splats {
                 fs::remove_file(path).map_err(Refusal::own)?;
                 self.pass_over(name);

@@ -17,14 +17,14 @@ use freerange_gaussians::{
     Gaussians, Harmonics, Splats,
     formats::{Format, Frame, WriteOptions, encode, parse},
 };
-use freerange_serve::{Limits, ServeConfig};
+use freerange_serve::{Limits, Quality, ServeConfig};
 use image::{Rgba, RgbaImage};
 
 #[test]
 fn the_example_becomes_gaussians_while_one_watches() {
     let engine = Arc::new(Fake { pause: Duration::from_millis(60), steps: 8, ..Fake::default() });
     let server = Running::plain(engine.clone());
-    let id = server.example(r#"{"samples": 2, "seed": 3, "iterations": 200}"#);
+    let id = server.example(r#"{"samples": 2, "seed": 3, "quality": "high", "iterations": 200}"#);
     // What the stream of events tells, and the Gaussians that it points at.
     let mut stream = TcpStream::connect(server.address).unwrap();
     std::io::Write::write_all(
@@ -64,6 +64,13 @@ fn the_example_becomes_gaussians_while_one_watches() {
     let options = engine.seen.lock().unwrap()[0].2;
     assert_eq!((options.samples, options.seed), (Some(2), Some(3)));
     assert_eq!((options.iterations, options.init), (Some(200), None));
+    // The page fills its form with what the job had, and says what others would have.
+    assert_eq!((options.quality, &job["options"]["quality"]), (Some(Quality::High), &"high".into()));
+    assert_eq!(server.json("/server")["defaults"]["quality"], "draft");
+    let plain = server.example("{}");
+    assert_eq!(server.until(&plain, &["done"])["options"]["quality"], "draft", "what it had is recorded");
+    assert_eq!(server.send("DELETE", &format!("/jobs/{plain}"), "", b"").status, 200);
+    assert_eq!(job["thumbnail"], true);
     let expected = Fake::cloud(4, 8);
     // Colors are rounded in files.
     let alike = |rows: &[f32]| rows.iter().zip(expected.rows()).all(|(a, b)| (a - b).abs() < 1e-6);
@@ -340,7 +347,7 @@ fn a_file_of_gaussians_is_a_result() {
         let id = reply.json()["id"].as_str().unwrap().to_owned();
         let job = server.until(&id, &["done", "failed"]);
         assert_eq!(job["state"], "done", "{job}");
-        assert_eq!((&job["title"], &job["may_go"]), (&name.split('.').next().unwrap().into(), &false.into()), "{job}");
+        assert_eq!((&job["title"], &job["may_go"]), (&name.into(), &false.into()), "{job}");
         assert_eq!(job["samples"], serde_json::json!([{ "seed": 0, "gaussians": 40 }]));
         let found: Vec<f64> = job["up"].as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect();
         assert!(found.iter().zip(up).all(|(a, b)| (a - b).abs() < 1e-6), "{name}: {found:?}");
@@ -353,6 +360,8 @@ fn a_file_of_gaussians_is_a_result() {
         for to in Format::ALL {
             let reply = server.get(&format!("/jobs/{id}/samples/0.{to}"));
             assert_eq!(reply.status, 200, "{name} to {to}");
+            let saved = format!("attachment; filename=\"{}-0.{to}\"", name.split('.').next().unwrap());
+            assert_eq!(reply.headers["content-disposition"], saved);
             let again = parse(to, &reply.body, std::path::Path::new("x"), frame).unwrap();
             assert_eq!(again.splats.cloud.len(), 40);
         }
@@ -410,8 +419,25 @@ fn files_of_gaussians_that_cannot_be_shown_are_refused() {
     }
     // Beside photos they are points of a capture, which nobody reads.
     let server = Running::plain(Fake::quick());
-    let parts = [folder("bowl/"), vec![Part::file("bowl/points3D.ply", ply)]].concat();
+    let parts = [folder("bowl/"), vec![Part::file("bowl/points3D.ply", ply.clone())]].concat();
     let reply = server.post_form(&parts);
     let job = server.until(reply.json()["id"].as_str().unwrap(), &["ready", "failed"]);
     assert_eq!((&job["state"], &job["passed_over"]), (&"ready".into(), &serde_json::json!(["bowl/points3D.ply"])));
+    // Beside cameras alone they are what a trainer wrote.
+    let reply = server.post_form(&[Part::file("run/cameras.json", "[]"), Part::file("run/cloud.ply", ply)]);
+    let job = server.until(reply.json()["id"].as_str().unwrap(), &["done", "failed"]);
+    assert_eq!((&job["state"], &job["title"]), (&"done".into(), &"run".into()), "{job}");
+}
+
+#[test]
+fn a_file_of_gaussians_that_is_cut_off_is_said_to_be() {
+    let server = Running::plain(Fake::quick());
+    for format in [Format::Ply, Format::Splat, Format::Spz, Format::Sog, Format::Glb] {
+        let (name, bytes) = (format!("half.{format}"), file(format, Frame::Z_UP));
+        let reply = server.post_form(&[Part::file(&name, &bytes[..bytes.len() / 2 + 1])]);
+        let job = server.until(reply.json()["id"].as_str().unwrap(), &["done", "failed"]);
+        let error = job["error"].as_str().unwrap_or_default();
+        assert!(error.starts_with(&name) && error.contains("cut off"), "{job}");
+        assert_eq!((&job["title"], &job["thumbnail"]), (&name.into(), &false.into()));
+    }
 }

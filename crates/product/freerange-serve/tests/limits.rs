@@ -154,14 +154,20 @@ fn no_answer_tells_where_files_are() {
     // A COLMAP model at the top of the dropped folder: its photos are looked for around it.
     let cameras = "1 PINHOLE 512 512 500 500 256 256\n";
     let images = "1 1 0 0 0 0 0 2 1 a.png\n\n2 1 0 0 0 1 0 2 1 b.png\n\n";
+    let photo = EXAMPLE.files[1].1;
     let colmap = |prefix: &str| {
-        vec![Part::file(&format!("{prefix}cameras.txt"), cameras), Part::file(&format!("{prefix}images.txt"), images)]
+        let at = |name: &str| format!("{prefix}{name}");
+        vec![
+            Part::file(&at("cameras.txt"), cameras),
+            Part::file(&at("images.txt"), images),
+            Part::file(&at("x.png"), photo),
+        ]
     };
     let mut cut = folder("x/");
     cut[2].bytes.truncate(30_000);
     let mut broken = folder("x/");
     broken[0].bytes = "{\"frames\": 3}".into();
-    let nothing = vec![Part::file("a.txt", "x")];
+    let nothing = vec![Part::file("a.txt", "x"), Part::file("b.png", photo)];
     let mut both = folder("x/");
     both.extend(colmap("x/sparse/0/"));
     for parts in [colmap("s/"), colmap(""), colmap("s/sparse/0/"), cut, broken, nothing, both] {
@@ -171,7 +177,7 @@ fn no_answer_tells_where_files_are() {
             let told = job.replace(&format!("\"id\":\"{id}\""), "");
             assert!(!told.contains(word), "{word}: {job}");
         }
-        assert!(!job.contains(" --"), "the page has no options: {job}");
+        assert!(!job.contains(" --") && !job.contains("`freerange"), "the page has no options and no commands: {job}");
     }
     for path in ["/server", "/jobs", "/metrics"] {
         assert!(!server.get(path).text().contains("home-of-somebody"), "{path}");

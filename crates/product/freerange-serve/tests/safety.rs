@@ -284,10 +284,12 @@ fn bytes_pixels_files_and_jobs_have_limits() {
     assert!(post(&[Part::file("a.png", picture)]).1.contains("at most 300000 pixels"));
     let (status, error) = post(&folder(""));
     assert!(status == 413 && error.contains("900000 pixels together"), "{error}");
-    assert_eq!(
-        post(&[Part::field("scene", "{}")]).1,
-        "expected files of photos and cameras, or one of Gaussians, found none"
-    );
+    // Neither photos nor Gaussians: no job is made.
+    for parts in [vec![Part::field("scene", "{}")], vec![Part::file("a.txt", "x")], folder("")[..1].to_vec()] {
+        let (status, error) = post(&parts);
+        assert!(status == 422 && error.starts_with("no photo and no file of Gaussians was sent: expected"), "{error}");
+    }
+    assert_eq!(server.json("/jobs"), serde_json::json!([]));
     assert_eq!(post(&[Part::field("example", "nothing")]).0, 404);
     assert_eq!(post(&[Part::field("scene", r#"{"masks": "magic"}"#), Part::file("a.txt", "x")]).0, 422);
     assert_eq!(post(&[Part::field("go", r#"{"samples": 9}"#), Part::file("a.txt", "x")]).0, 422);

@@ -95,6 +95,7 @@ fn a_search_can_be_cancelled_and_is_in_nobodys_way() {
         thread::sleep(Duration::from_millis(5));
     };
     assert_eq!((&status["state"], &status["done"], &status["total"]), (&"reading".into(), &1.into(), &6.into()));
+    assert_eq!(status["thumbnail"], false, "the page asks for no picture yet");
     // Jobs that have cameras are read and computed meanwhile.
     let other = server.example("{}");
     server.until(&other, &["done"]);

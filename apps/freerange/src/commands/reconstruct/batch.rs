@@ -348,6 +348,15 @@ fn forget(folder: &Path) -> Result<(), CliError> {
     }
 }
 
+/// Before one scene alone replaces what is in `folder`: a record of it would be wrong.
+pub fn replace(folder: &Path) -> Result<(), CliError> {
+    match recorded(folder) {
+        Ok(Some(_)) => forget(folder),
+        // Nothing, or a file that is not ours.
+        _ => Ok(()),
+    }
+}
+
 /// Size and last change of files.
 fn stamps(files: &[PathBuf]) -> Result<BTreeMap<PathBuf, String>, CliError> {
     let stamp = |file: &PathBuf| {

@@ -7,7 +7,7 @@ use freerange_optim::meshing::{MeshConfig, MeshFormat, mesh_of, save};
 use freerange_scene::write_colmap;
 use freerange_util::Note;
 
-use crate::{error::CliError, output::OutputFolder};
+use crate::{error::CliError, output::OutputFolder, progress::Waiting};
 
 /// What results are written as.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -75,7 +75,11 @@ impl Place<'_> {
             let format = match format {
                 Written::Mesh(format) => {
                     let name = format!("mesh{suffix}.{format}");
-                    match mesh.get_or_insert_with(|| mesh_of(splats, &MeshConfig::default())) {
+                    let made = || {
+                        let _waiting = Waiting::new("meshing", "takes some seconds");
+                        mesh_of(splats, &MeshConfig::default())
+                    };
+                    match mesh.get_or_insert_with(made) {
                         Ok(mesh) => save(mesh, &output.path(&name)?, frame.to(Frame::Y_UP))?,
                         // The Gaussians are there all the same.
                         Err(e) => notes.push(Note::dropped(format!("{name}: {e}"))),

@@ -8,7 +8,7 @@ use std::{
 
 use freerange_util::Invalid;
 
-use crate::formats::error::problem;
+use crate::formats::error::{ended, problem};
 
 /// Decoded bytes per byte of a file, at most. Real files stay far below; hostile ones blow up a thousandfold.
 const MAX_EXPANSION: usize = 256;
@@ -30,7 +30,7 @@ pub struct Cursor<'a> {
 impl<'a> Cursor<'a> {
     pub fn take(&mut self, field: &str, count: usize) -> Result<&'a [u8], Invalid> {
         let Some((taken, left)) = self.left.split_at_checked(count) else {
-            return Err(problem(field, format!("{count} bytes"), format!("{} and the end", self.left.len())));
+            return Err(problem(field, format!("{count} bytes"), ended(self.left.len())));
         };
         self.left = left;
         Ok(taken)

@@ -13,7 +13,7 @@ use serde_json::Value;
 use crate::formats::{
     Decoded, Frame,
     bytes::{Beside, Cursor, check_expansion},
-    error::problem,
+    error::{CUT_OFF, json_problem, problem},
     glb::{BINARY, EXTENSION, JSON, MAGIC},
     glb_accessor::{Accessor, View},
     placed::{EXPECTED, Similarity},
@@ -78,7 +78,7 @@ pub fn decode(bytes: &[u8], beside: &Beside) -> Result<Decoded, Invalid> {
         text @ [b'{', ..] => (text, None),
         _ => chunks(bytes)?,
     };
-    let gltf: Gltf = serde_json::from_slice(json).map_err(|e| problem("JSON", "glTF 2.0", e))?;
+    let gltf: Gltf = serde_json::from_slice(json).map_err(|e| json_problem("JSON", "glTF 2.0", &e))?;
     let known = [EXTENSION, "KHR_mesh_quantization"];
     if let Some(other) = gltf.extensions_required.iter().find(|e| !known.contains(&e.as_str())) {
         return Err(problem("extensionsRequired", known.join(" or "), other));
@@ -180,7 +180,9 @@ fn chunks(bytes: &[u8]) -> Result<(&[u8], Option<&[u8]>), Invalid> {
     }
     let length = cursor.u32("length")?;
     if length as usize != bytes.len() {
-        return Err(problem("length", format!("{} as the file", bytes.len()), length));
+        let why = if length as usize > bytes.len() { format!(": {CUT_OFF}") } else { String::new() };
+        let expected = format!("{length} bytes, as the header says");
+        return Err(problem("length", expected, format!("{}{why}", bytes.len())));
     }
     let (mut json, mut binary) = (None, None);
     while !cursor.left.is_empty() {

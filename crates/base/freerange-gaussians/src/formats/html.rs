@@ -9,7 +9,11 @@ use freerange_util::Invalid;
 use glam::DVec3;
 use sha2::{Digest, Sha256};
 
-use crate::formats::{Decoded, Encoded, Frame, error::problem, quantize::Row};
+use crate::formats::{
+    Decoded, Encoded, Frame,
+    error::{CUT_OFF, problem},
+    quantize::Row,
+};
 
 const PAGE: &str = include_str!("viewer/page.html");
 const STYLE: &str = include_str!("viewer/style.css");
@@ -54,9 +58,15 @@ pub fn encode(cloud: &Gaussians, frame: Frame) -> Encoded {
 pub fn decode(bytes: &[u8]) -> Result<(Decoded, Option<DVec3>), Invalid> {
     let wrong = |expected: &'static str, found: &dyn std::fmt::Display| problem("Gaussians", expected, found);
     let page = std::str::from_utf8(bytes).map_err(|e| problem("page", "UTF-8", e))?;
-    let found = page.split_once(BEFORE).and_then(|(_, rest)| rest.split_once("\">"));
+    let start = page.split_once(BEFORE).map(|(_, rest)| rest);
+    let found = start.and_then(|rest| rest.split_once("\">"));
     let Some((up, data)) = found.and_then(|(up, rest)| Some((up, rest.split_once(AFTER)?.0))) else {
-        let found = "another one: give the file of Gaussians that it shows, such as a .ply";
+        let found = match start {
+            Some(_) => format!("one that is {CUT_OFF}"),
+            None => {
+                "another one, or the file is cut off: give the file of Gaussians that it shows, such as a .ply".into()
+            }
+        };
         return Err(wrong("a page that this program wrote, such as view.html", &found));
     };
     let up: Option<Vec<f64>> = up.split(' ').map(|v| v.parse().ok()).collect();

@@ -10,7 +10,7 @@ use zip::ZipArchive;
 use crate::formats::{
     Decoded,
     bytes::{Beside, check_expansion},
-    error::problem,
+    error::{archive_problem, json_problem, problem},
     quantize::{Row, color_of_sh, from_smallest_three, logit_of_byte, set_rotation},
     sog::{ANTIALIASED, CENTROIDS, CODES, FLAT, Harmonic, Meta},
 };
@@ -29,7 +29,8 @@ pub fn decode(bytes: &[u8], beside: &Beside) -> Result<Decoded, Invalid> {
     let mut files = match bytes.trim_ascii_start() {
         [b'{', ..] => Files::Beside(beside),
         _ => {
-            let archive = ZipArchive::new(Cursor::new(bytes)).map_err(|e| problem("archive", "a zip archive", e))?;
+            let archive =
+                ZipArchive::new(Cursor::new(bytes)).map_err(|e| archive_problem(bytes, "a zip archive", e))?;
             Files::Archive { archive, size: bytes.len() }
         }
     };
@@ -40,7 +41,7 @@ pub fn decode(bytes: &[u8], beside: &Beside) -> Result<Decoded, Invalid> {
         Files::Beside(_) => bytes.to_vec(),
         archive => archive.file("meta.json", META_LIMIT)?,
     };
-    let meta: serde_json::Value = serde_json::from_slice(&meta).map_err(|e| problem("meta.json", "JSON", e))?;
+    let meta: serde_json::Value = serde_json::from_slice(&meta).map_err(|e| json_problem("meta.json", "JSON", &e))?;
     match meta.get("version") {
         Some(version) if *version == 2 => {}
         Some(version) => return Err(problem("meta.json, version", "2", version)),

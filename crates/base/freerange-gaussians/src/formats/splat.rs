@@ -8,7 +8,7 @@ use freerange_util::Invalid;
 
 use crate::formats::{
     Decoded, Encoded,
-    error::problem,
+    error::{CUT_OFF, problem},
     quantize::{Row, byte, log_scale, logit_of_byte, set_rotation, unorm8},
 };
 
@@ -39,7 +39,8 @@ pub fn encode(cloud: &Gaussians) -> Encoded {
 pub fn decode(bytes: &[u8]) -> Result<Decoded, Invalid> {
     let (rows, rest) = bytes.as_chunks::<BYTES>();
     if !rest.is_empty() {
-        return Err(problem("length", "a multiple of 32 bytes", bytes.len()));
+        let found = format!("{}: {CUT_OFF}, or no .splat", bytes.len());
+        return Err(problem("length", "a multiple of 32 bytes", found));
     }
     let mut cloud = Vec::with_capacity(rows.len() * channel::COUNT);
     for (i, record) in rows.iter().enumerate() {

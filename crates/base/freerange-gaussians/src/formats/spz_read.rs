@@ -12,7 +12,7 @@ use ruzstd::decoding::StreamingDecoder;
 use crate::formats::{
     Decoded, Frame,
     bytes::{Cursor, check_expansion},
-    error::problem,
+    error::{ended, problem, stream_problem},
     quantize::{Row, color_of_sh, from_smallest_three, logit_of_byte, set_rotation},
     spz::{ANTIALIASED, COLOR_SCALE, COORDINATES, EXTENSIONS, HEADER_4, MAGIC, OUR_TIME},
 };
@@ -142,7 +142,7 @@ fn legacy(bytes: &[u8]) -> Result<Parts, Invalid> {
     for (stream_out, (length, name)) in streams.iter_mut().zip(header.lengths().into_iter().zip(NAMES)) {
         *stream_out = up_to(&mut stream, length, name)?;
         if stream_out.len() < length {
-            return Err(problem(name, format!("{length} bytes"), format!("{} and the end", stream_out.len())));
+            return Err(problem(name, format!("{length} bytes"), ended(stream_out.len())));
         }
     }
     let extensions = match header.flags & EXTENSIONS {
@@ -188,7 +188,7 @@ fn streamed(bytes: &[u8]) -> Result<Parts, Invalid> {
         let mut decoder = StreamingDecoder::new(packed).map_err(|e| broken(&e))?;
         streams[k] = up_to(&mut decoder, length, NAMES[k])?;
         if streams[k].len() < length {
-            return Err(problem(NAMES[k], format!("{length} bytes"), format!("{} and the end", streams[k].len())));
+            return Err(problem(NAMES[k], format!("{length} bytes"), ended(streams[k].len())));
         }
     }
     let extensions = if header.flags & EXTENSIONS == 0 { Vec::new() } else { bytes[HEADER_4..start].to_vec() };
@@ -239,7 +239,7 @@ fn magic(cursor: &mut Cursor) -> Result<(), Invalid> {
 fn up_to(stream: &mut impl Read, count: usize, field: &str) -> Result<Vec<u8>, Invalid> {
     let mut bytes = Vec::new();
     let read = stream.take(count as u64).read_to_end(&mut bytes);
-    read.map_err(|e| problem(field, "a compressed stream", e))?;
+    read.map_err(|e| stream_problem(field, &e))?;
     Ok(bytes)
 }
 

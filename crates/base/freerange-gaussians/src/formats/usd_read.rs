@@ -15,7 +15,7 @@ use zip::ZipArchive;
 
 use crate::formats::{
     Decoded, Frame,
-    error::problem,
+    error::{archive_problem, problem},
     placed::{EXPECTED, Similarity},
     quantize::{Row, color_of_sh, encoded, log_scale, logit, set_rotation},
     usd::{COEFFICIENTS, DEGREE, DISPLAY_COLOR, OPACITIES, ORIENTATIONS, POSITIONS, PRIM, SCALES},
@@ -59,7 +59,7 @@ pub fn decode(bytes: &[u8]) -> Result<Decoded, Invalid> {
 
 /// The first file of an archive, its root layer.
 fn first_layer(bytes: &[u8]) -> Result<Cow<'static, [u8]>, Invalid> {
-    let broken = |e: &dyn std::fmt::Display| problem("archive", "a .usdz archive", e);
+    let broken = |e: &dyn std::fmt::Display| archive_problem(bytes, "a .usdz archive", e);
     let mut archive = ZipArchive::new(Cursor::new(bytes)).map_err(|e| broken(&e))?;
     let first = archive.by_index(0).map_err(|e| broken(&e))?;
     // Files in it are stored as they are.

@@ -3,7 +3,7 @@
 
 use freerange_util::Invalid;
 
-use crate::formats::error::problem;
+use crate::formats::error::{CUT_OFF, problem};
 
 /// Prims within each other, at most.
 const MOST_NESTED: usize = 64;
@@ -86,7 +86,9 @@ struct Parser<'a> {
 impl<'a> Parser<'a> {
     fn wrong(&self, expected: &str, found: &str) -> Invalid {
         let found: String = found.chars().take(40).collect();
-        problem(format!("layer, line {}", self.line), expected, format!("{found:?}"))
+        // Whole files end with a line.
+        let why = if self.text[self.at..].contains('\n') { String::new() } else { format!(": {CUT_OFF}") };
+        problem(format!("layer, line {}", self.line), expected, format!("{found:?}{why}"))
     }
 
     fn peek(&mut self) -> Result<Token<'a>, Invalid> {

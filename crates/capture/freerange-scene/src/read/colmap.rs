@@ -41,6 +41,12 @@ const MODELS: [&str; 18] = [
     "EQUIRECTANGULAR",
 ];
 
+/// Whether a file has a name of those of a model.
+pub(super) fn is_one(file: &Path) -> bool {
+    let names = ["cameras", "images", "points3D", "frames", "rigs"];
+    file.file_stem().is_some_and(|stem| names.iter().any(|name| stem == *name))
+}
+
 /// A camera: size, focal lengths, principal point, lens.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ColmapCamera {

@@ -246,9 +246,9 @@ pub fn cameras_with(path: &Path, config: &ReadConfig) -> Result<Cameras, SceneEr
             Some("xml") => Format::Metashape,
             Some("csv") => Format::Realitycapture,
             Some("opf") => Format::Opf,
-            Some("bin" | "txt") => Format::Colmap,
+            Some("bin" | "txt") if colmap::is_one(path) => Format::Colmap,
             _ => {
-                let expected = "a folder, or a file .json, .xml, .csv or .opf";
+                let expected = "a folder, a file .json, .xml, .csv or .opf, or COLMAP's cameras or images, .bin or .txt";
                 return Err(In(path).field("", "file name", expected, path.display()));
             }
         };

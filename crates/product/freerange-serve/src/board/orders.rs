@@ -12,6 +12,7 @@ impl Board {
     /// Lets a job compute.
     pub fn go(&self, id: &str, options: JobOptions) -> Result<(), Refusal> {
         options.check().map_err(|e| Refusal::new(422, e))?;
+        let options = self.complete(options);
         let turn = {
             let mut table = self.table();
             table.turns += 1;

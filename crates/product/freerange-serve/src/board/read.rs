@@ -76,7 +76,10 @@ impl Board {
             Err(e) => return tracing::error!("no threads to read photos: {e}"),
         };
         while let Some(unread) = self.next_unread(searching) {
-            let read = pool.install(|| guarded(|| self.read(&unread)));
+            // Errors in the log name it, also those of other threads.
+            let span = tracing::error_span!("job", id = %unread.id);
+            let _job = span.enter();
+            let read = pool.install(|| span.in_scope(|| guarded(|| self.read(&unread))));
             let Unread { id, folder, cancel, .. } = unread;
             clear(&uploads(&folder));
             let bytes = size_of(&folder);
@@ -101,7 +104,7 @@ impl Board {
                         job.record.state = State::Ready;
                         if let Some(options) = job.go.take() {
                             // Its turn is that of its arrival, however long it took to read.
-                            (job.record.state, job.record.options) = (State::Queued, options);
+                            (job.record.state, job.record.options) = (State::Queued, self.complete(options));
                         }
                     }
                     Err(e) => {
@@ -120,7 +123,8 @@ impl Board {
     fn read(&self, unread: &Unread) -> Result<Read, Refusal> {
         let Unread { id, folder, options, splats, cancel } = unread;
         if let Some(file) = splats {
-            let found = splats::prepare(file, folder, options.up()?, &self.limits)?;
+            let stop = Stop::on(cancel.clone(), None);
+            let found = splats::prepare(file, folder, options.up()?, &self.limits, &stop)?;
             save_thumbnail(folder, &splats::thumbnail(&*self.engine, &found))?;
             return Ok(Read { understood: found.understood, result: Some((found.gaussians, found.up)) });
         }
@@ -144,7 +148,8 @@ impl Board {
                 list.splice(0..0, more.into_iter().map(Value::from));
             }
         }
-        let first = image::open(scene::view_file(folder, 0)).map_err(Refusal::own)?.into_rgba8();
+        let view = scene::view_file(folder, 0);
+        let first = image::open(&view).map_err(Refusal::file(&view))?.into_rgba8();
         save_thumbnail(folder, &on_white(&first))?;
         Ok(Read { understood, result: None })
     }

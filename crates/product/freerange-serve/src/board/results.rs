@@ -88,8 +88,11 @@ impl Board {
         let frame = Frame::with_up(DVec3::from_array(up)).unwrap_or_default();
         let options = WriteOptions { frame, ..WriteOptions::default() };
         let encoded = encode(&splats, format, &options).map_err(Refusal::own)?;
+        // The title of a file of Gaussians is its name.
+        let stem = title.rsplit_once('.').filter(|(_, end)| Format::from_extension(end).is_some());
+        let stem = stem.map_or(&*title, |(stem, _)| stem);
         // Nothing of a client's name may end the header or name a folder.
-        let plain: String = title.chars().filter(|c| c.is_ascii_alphanumeric() || "-_".contains(*c)).take(40).collect();
+        let plain: String = stem.chars().filter(|c| c.is_ascii_alphanumeric() || "-_".contains(*c)).take(40).collect();
         let plain = if plain.is_empty() { "gaussians".to_owned() } else { plain };
         Ok((encoded.bytes, format!("{plain}-{i}.{format}")))
     }

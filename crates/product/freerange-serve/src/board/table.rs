@@ -119,7 +119,7 @@ impl Job {
             "id": r.id, "title": r.title, "created": r.created, "state": r.state, "error": r.error,
             "position": waiting.iter().position(|t| *t == r.turn).filter(|_| r.state == State::Queued),
             "stage": running.then_some(p.stage), "sample": p.sample, "done": p.done, "total": p.total, "loss": p.loss,
-            "estimate": estimate, "version": self.version,
+            "estimate": estimate, "thumbnail": !r.understood.is_null(), "version": self.version,
         })
     }
 }

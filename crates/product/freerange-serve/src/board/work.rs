@@ -61,6 +61,8 @@ impl Board {
     /// Computes, one job after the other, until the server ends.
     pub fn compute_all(&self) {
         while let Some(id) = self.next_queued() {
+            // Errors in the log name it.
+            let _job = tracing::error_span!("job", %id).entered();
             let started = self.change(&id, |job| {
                 if job.record.state != State::Queued {
                     return Err(Refusal::new(409, ""));
@@ -222,6 +224,6 @@ pub(super) fn save_thumbnail(folder: &Path, picture: &RgbaImage) -> Result<(), R
     let beside = folder.join("thumbnail.new.png");
     let mut bytes = Cursor::new(Vec::new());
     resize_area(picture, w, h).write_to(&mut bytes, ImageFormat::Png).map_err(Refusal::own)?;
-    fs::write(&beside, bytes.into_inner()).map_err(Refusal::own)?;
-    fs::rename(&beside, thumbnail_file(folder)).map_err(Refusal::own)
+    fs::write(&beside, bytes.into_inner()).map_err(Refusal::file(&beside))?;
+    fs::rename(&beside, thumbnail_file(folder)).map_err(Refusal::file(&beside))
 }

@@ -1,5 +1,5 @@
 // The brush that corrects a mask.
-import { attempt, box, button, call, get, input } from "./dom.js";
+import { box, button, call, get, input, on } from "./dom.js";
 import { app } from "./state.js";
 import { Zoom } from "./zoom.js";
 
@@ -36,10 +36,7 @@ const maskOf = async (job, k) => {
   return context.getImageData(0, 0, width, height).data.filter((_, i) => i % 4 === 3);
 };
 
-/**
- * Photos of the same size whose cameras are turned by a few degrees only.
- * @param {number} k
- */
+/** Photos of the same size whose cameras are turned by a few degrees only. @param {number} k */
 const similar = (k) => {
   const views = app.job?.understood?.views ?? [], { camera } = views[k];
   return views.flatMap(({ camera: other }, j) => {
@@ -123,10 +120,7 @@ const remember = () => {
   brush.undo.push({ mask: brush.mask.slice(), copy: brush.copy });
   if (brush.undo.length > UNDO) brush.undo.shift();
 };
-/**
- * Where the pointer is in the photo.
- * @param {MouseEvent} e
- */
+/** Where the pointer is in the photo. @param {MouseEvent} e */
 const place = (e) => {
   if (!brush) return [0, 0];
   // The canvas may be letterboxed in its box.
@@ -240,7 +234,7 @@ const png = (mask, width, height) => {
   context?.putImageData(picture, 0, 0);
   return canvas.convertToBlob({ type: "image/png" });
 };
-button("paint-save").addEventListener("click", () => void attempt(async () => {
+on("paint-save", async () => {
   if (!brush || !app.job) return;
   const { k, first, mask, width, height, copy, like } = brush, { id } = app.job;
   dialog.close();
@@ -252,4 +246,4 @@ button("paint-save").addEventListener("click", () => void attempt(async () => {
     await call("PUT", `/jobs/${id}/masks/${other}`, await png(there, width, height));
   }
   await after();
-}));
+});

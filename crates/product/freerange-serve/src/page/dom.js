@@ -43,16 +43,13 @@ export const complain = (problem) => { box("alert").textContent = problem instan
  * @param {BodyInit} [body]
  */
 export const call = async (method, path, body) => {
-  const response = await fetch(path, { method, body, credentials: "same-origin" });
+  const response = await fetch(path, { method, body });
   const answer = await response.json().catch(() => ({}));
   if (!response.ok) throw new Error(answer.error ?? `${method} ${path}: ${response.status}`);
   return answer;
 };
 
-/**
- * What a button or a key begins; what goes wrong is said.
- * @param {() => Promise<void>} work
- */
+/** What a button or a key begins; what goes wrong is said. @param {() => Promise<void>} work */
 export const attempt = async (work) => {
   complain("");
   try {
@@ -63,9 +60,13 @@ export const attempt = async (work) => {
 };
 
 /**
- * Buttons in a row are one stop of the Tab key; arrow keys move among them.
- * @param {HTMLElement} bar
+ * What a press of a button begins.
+ * @param {string} id
+ * @param {() => Promise<void>} work
  */
+export const on = (id, work) => button(id).addEventListener("click", () => void attempt(work));
+
+/** Buttons in a row are one stop of the Tab key; arrow keys move among them. @param {HTMLElement} bar */
 export const toolbar = (bar) => {
   const all = () => [...bar.querySelectorAll("button")].filter((b) => !b.hidden && !b.disabled);
   /** @param {?HTMLButtonElement} one */

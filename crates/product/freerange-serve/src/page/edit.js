@@ -1,5 +1,5 @@
 // Parts of a result left out: what lies outside of a box, and what floats apart from the object. Each step is saved, and can be undone.
-import { attempt, box, button, call, get, input, make } from "./dom.js";
+import { attempt, box, button, call, get, input, make, on, select } from "./dom.js";
 import { caption, seedOf } from "./gaussians.js";
 import { app, viewed } from "./state.js";
 
@@ -14,22 +14,29 @@ const SHARE = 0.02;
  * @type {?Edit}
  */
 let edit = null;
+const fold = get("edit", HTMLDetailsElement);
 
 /** @param {string} path */
 const bytes = async (path) => {
-  const response = await fetch(path, { credentials: "same-origin" });
+  const response = await fetch(path);
   if (!response.ok) throw new Error(`${path}: ${response.status}`);
   return response.arrayBuffer();
 };
 
 const ends = () => [0, 1, 2].map((axis) => [Number(input(`from-${axis}`).value) / 100, Number(input(`to-${axis}`).value) / 100]);
 
-/**
- * Which Gaussians are kept and lie in the box.
- * @param {Edit} of
- */
-const inside = ({ rows, kept, low, high }) => {
-  const limits = ends().map(([from, to], axis) => [low[axis] + from * (high[axis] - low[axis]), low[axis] + to * (high[axis] - low[axis])]);
+/** The box: where it begins and ends along each axis. Each slider says its place. @param {Edit} of */
+const limitsOf = ({ low, high }) => ends().map((both, axis) => both.map((share, i) => {
+  const place = low[axis] + share * (high[axis] - low[axis]), text = place.toPrecision(3), name = `${["from", "to"][i]}-${axis}`;
+  box(`${name}-at`).textContent = text;
+  input(name).setAttribute("aria-valuetext", text);
+  return place;
+}));
+
+/** Which Gaussians are kept and lie in the box, which is shown. @param {Edit} of */
+const inside = (of) => {
+  const { rows, kept } = of, limits = limitsOf(of);
+  app.crop = [0, 1].map((i) => limits.map((both) => both[i]));
   return kept.map((v, i) => (v && limits.every(([from, to], axis) => rows[i * CHANNELS + axis] >= from && rows[i * CHANNELS + axis] <= to) ? 1 : 0));
 };
 
@@ -47,10 +54,14 @@ const show = (mask) => {
   button("edit-undo").disabled = edit.before.length === 0;
 };
 
-const whole = () => [0, 1, 2].forEach((axis) => {
-  input(`from-${axis}`).value = "0";
-  input(`to-${axis}`).value = "100";
-});
+/** The box has all of it again. */
+const whole = () => {
+  for (const axis of [0, 1, 2]) {
+    input(`from-${axis}`).value = "0";
+    input(`to-${axis}`).value = "100";
+  }
+  if (edit) inside(edit);
+};
 
 /** @param {number} sample */
 const begin = async (sample) => {
@@ -89,10 +100,7 @@ const save = async (kept, undoes = false) => {
   viewed.dispatchEvent(new Event("viewed"));
 };
 
-/**
- * Gaussians of parts that hang together with few others, or none, are left out.
- * @param {Edit} of
- */
+/** Gaussians of parts that hang together with few others, or none, are left out. @param {Edit} of */
 const tidy = ({ rows, kept, low }) => {
   // What floats far away makes the object no larger.
   const extent = [0, 1, 2].map((axis) => {
@@ -136,23 +144,31 @@ const tidy = ({ rows, kept, low }) => {
 
 /** Offers to edit the job's samples. */
 export const offerEdit = () => {
-  const { job } = app, select = get("edit-sample", HTMLSelectElement);
-  edit = null;
-  get("edit", HTMLDetailsElement).open = false;
-  select.replaceChildren(...(job ? job.samples.map((_, i) => make("option", { value: String(i) }, seedOf(job, i, ""))) : []));
-  box("edit-which").hidden = select.options.length < 2;
+  const { job } = app;
+  edit = app.crop = null;
+  fold.open = false;
+  fold.hidden = job?.state !== "done";
+  select("edit-sample").replaceChildren(...(job ? job.samples.map((_, i) => make("option", { value: String(i) }, seedOf(job, i, ""))) : []));
+  box("edit-which").hidden = select("edit-sample").options.length < 2;
 };
-const start = () => void attempt(() => begin(Number(get("edit-sample", HTMLSelectElement).value)));
-get("edit", HTMLDetailsElement).addEventListener("toggle", (e) => {
-  if (e.target instanceof HTMLDetailsElement && e.target.open) start();
+const start = () => void attempt(() => begin(Number(select("edit-sample").value)));
+fold.addEventListener("toggle", () => {
+  app.crop = null;
+  if (fold.open) start();
   else if (edit) show(edit.kept);
 });
-get("edit-sample", HTMLSelectElement).addEventListener("change", start);
-for (const axis of [0, 1, 2]) for (const end of ["from", "to"]) input(`${end}-${axis}`).addEventListener("input", () => { if (edit) show(inside(edit)); });
-button("edit-crop").addEventListener("click", () => void attempt(async () => { if (edit) await save(inside(edit)); }));
-button("edit-tidy").addEventListener("click", () => void attempt(async () => { if (edit) await save(tidy(edit)); }));
-button("edit-all").addEventListener("click", () => void attempt(async () => { if (edit) await save(edit.kept.map(() => 1)); }));
-button("edit-undo").addEventListener("click", () => void attempt(async () => {
+select("edit-sample").addEventListener("change", start);
+for (const axis of [0, 1, 2]) {
+  for (const [end, value] of [["from", "0"], ["to", "100"]]) {
+    const id = `${end}-${axis}`, slider = make("input", { id, type: "range", value });
+    slider.addEventListener("input", () => { if (edit) show(inside(edit)); });
+    box("crop").append(make("label", {}, make("span", {}, `${"xyz"[axis]} ${end} `, make("b", { id: `${id}-at` })), slider));
+  }
+}
+on("edit-crop", async () => { if (edit) await save(inside(edit)); });
+on("edit-tidy", async () => { if (edit) await save(tidy(edit)); });
+on("edit-all", async () => { if (edit) await save(edit.kept.map(() => 1)); });
+on("edit-undo", async () => {
   const last = edit?.before.pop();
   if (last) await save(last, true);
-}));
+});

@@ -4,6 +4,7 @@
  * @typedef {import("./state.js").Job} Job
  */
 import { box, get } from "./dom.js";
+import { showCameras } from "./panes.js";
 import { app, viewed } from "./state.js";
 
 let fetching = false;
@@ -12,7 +13,7 @@ let heatTimer;
 
 /** @param {string} path */
 const rows = async (path) => {
-  const response = await fetch(path, { credentials: "same-origin" });
+  const response = await fetch(path);
   return response.ok ? new Float32Array(await response.arrayBuffer()) : null;
 };
 
@@ -23,6 +24,7 @@ export const estimates = async () => {
   try {
     while (app.job?.state === "running" && app.job.estimate && app.job.estimate.number > app.drawn) {
       const { id, estimate } = app.job;
+      if (!app.drawn && app.looking === null) showCameras(false);
       for (const part of estimate.parts) {
         const gaussians = await rows(`/jobs/${id}/estimates/${estimate.number}/${part.sample}`);
         if (!gaussians || app.job?.id !== id) break;

@@ -5,10 +5,7 @@ const COLORS = 256;
 /** Values of a channel in the histogram. */
 const LEVELS = 32;
 
-/**
- * The mean colors of `COLORS` boxes of the histogram, by median cut, and the box of each entry.
- * @param {Uint8ClampedArray[]} frames RGBA
- */
+/** The mean colors of `COLORS` boxes of the histogram, by median cut, and the box of each entry. @param {Uint8ClampedArray[]} frames RGBA */
 const palette = (frames) => {
   const counts = new Uint32Array(LEVELS ** 3), sums = [0, 1, 2].map(() => new Float64Array(LEVELS ** 3));
   for (const frame of frames) {
@@ -48,10 +45,7 @@ const palette = (frames) => {
  */
 const entryOf = (frame, i) => ((frame[i] >> 3) << 10) | ((frame[i + 1] >> 3) << 5) | (frame[i + 2] >> 3);
 
-/**
- * LZW as GIF has it: codes of 9 to 12 bits, in blocks of at most 255 bytes.
- * @param {Uint8Array} pixels
- */
+/** LZW as GIF has it: codes of 9 to 12 bits, in blocks of at most 255 bytes. @param {Uint8Array} pixels */
 const compressed = (pixels) => {
   const CLEAR = 256, END = 257, MOST = 4096;
   /** @type {number[]} */

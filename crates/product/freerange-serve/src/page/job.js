@@ -1,6 +1,5 @@
 // One job: how far it is, its photos, its results.
 /**
- * @typedef {import("./state.js").Status} Status
  * @typedef {import("./state.js").Job} Job
  * @typedef {import("./state.js").Understood} Understood
  */
@@ -14,19 +13,27 @@ import { app } from "./state.js";
 /** What is done after a mask was edited. */
 export const hooks = { edited: async () => {} };
 
-const WORDS = { canonicalize: "finding the object", symmetry: "looking for symmetry", propose: "proposing", refine: "refining with the network", optimize: "optimizing on the photos" };
+/** The steps of the pipeline, in order. @type {Record<string, string>} */
+const STEPS = { canonicalize: "placing the object", symmetry: "looking for symmetry", propose: "making proposals", refine: "refining with the network", optimize: "optimizing on the photos" };
+/** What each format is good for. @type {Record<string, string>} */
+const USES = {
+  ply: "Nearly every viewer and editor of Gaussians", splat: "Viewers on the web", spz: "Small; most viewers", sog: "Small; PlayCanvas, SuperSplat, Spark",
+  glb: "three.js, Babylon.js, PlayCanvas, Cesium; Gaussians, not a mesh", usda: "OpenUSD, Omniverse; text", usdz: "OpenUSD, Omniverse", html: "A viewer with the object in it, for any browser",
+};
 
+/** Steps of the search for cameras. @type {Record<string, string>} */
 const SEARCH = { features: "features of the photos", matches: "matches between photos", model: "poses", checks: "checks of the poses" };
 
-/** @param {Status} s */
+/** @param {Job} s */
 const sentence = (s) => {
+  const { samples, quality } = s.options, spent = s.seconds.reduce((sum, [, v]) => sum + v, 0), step = s.stage;
   switch (s.state) {
-    case "reading": return s.stage ? `Finding the cameras, step ${s.done + 1} of ${s.total}: ${SEARCH[/** @type {keyof typeof SEARCH} */ (s.stage)] ?? s.stage}. This takes minutes.` : "The files are read.";
-    case "ready": return "Ready. Look at the masks, then press Go.";
+    case "reading": return s.stage ? `Finding the cameras, step ${s.done + 1} of ${s.total}: ${SEARCH[s.stage] ?? s.stage}. This takes minutes.` : "Reading the files…";
+    case "ready": return "Ready. Look at the cameras and the masks, then press Go.";
     case "queued": return s.position ? `Waiting: ${s.position} before this one.` : "Waiting.";
-    case "running": return s.stage ? `${WORDS[/** @type {keyof typeof WORDS} */ (s.stage)] ?? s.stage}: step ${s.done} of ${s.total}${left(s)}` : "Starting.";
-    case "done": return "Done.";
-    case "cancelled": return "Cancelled.";
+    case "running": return step ? `${(samples ?? 1) > 1 ? `Sample ${s.sample + 1} of ${samples}, step` : "Step"} ${Object.keys(STEPS).indexOf(step) + 1} of 5: ${STEPS[step] ?? step}, ${s.done} of ${s.total}${left(s)}` : "Starting.";
+    case "done": return spent ? `Done in ${spent.toFixed(1)} s${quality ? `, quality ${quality}` : ""}.` : "Done.";
+    case "cancelled": return s.samples.length ? "Cancelled; the earlier result is kept." : "Cancelled.";
     case "failed": return `Failed: ${s.error ?? ""}`;
     default: return s.error ?? s.state;
   }
@@ -35,21 +42,18 @@ const sentence = (s) => {
 /** When the stage began that is computed now, and at which of its steps. */
 const since = { stage: "", time: 0, done: 0 };
 
-/**
- * How long this stage will take still, going by how long it took so far.
- * @param {Status} s
- */
+/** How long this step will take still, going by how long it took so far. @param {Job} s */
 const left = (s) => {
   const stage = `${s.id} ${s.stage} ${s.sample}`, now = performance.now();
   if (stage !== since.stage || s.done < since.done) Object.assign(since, { stage, time: now, done: s.done });
   const steps = s.done - since.done, seconds = (now - since.time) / 1000;
   if (steps < 1 || seconds < 1 || s.done >= s.total) return "";
   const more = seconds / steps * (s.total - s.done);
-  return more > 90 ? `, about ${Math.round(more / 60)} min left` : `, about ${Math.max(1, Math.round(more))} s left`;
+  return `, about ${more > 90 ? `${Math.round(more / 60)} min` : `${Math.max(1, Math.round(more))} s`} left in this step`;
 };
 
 let said = "";
-/** @param {Status} s */
+/** @param {Job} s */
 export const showStatus = (s) => {
   const text = sentence(s);
   // A screen reader hears of stages, not of every step.
@@ -65,6 +69,15 @@ export const showStatus = (s) => {
   document.body.dataset.state = s.state;
 };
 
+let filled = "";
+/** The form has what the job was computed with. @param {Job} now */
+const fill = ({ id, options }) => {
+  const key = JSON.stringify([id, options]), values = { samples: 1, seed: 0, quality: "", init: "", iterations: "" };
+  if (key === filled) return;
+  filled = key;
+  for (const [name, otherwise] of Object.entries(values)) Object.assign(box(name), { value: options[/** @type {keyof typeof values} */ (name)] ?? otherwise });
+};
+
 export const showJob = () => {
   const now = app.job;
   box("job").hidden = !now;
@@ -72,6 +85,7 @@ export const showJob = () => {
   const understood = now.understood;
   box("job-title").textContent = now.title;
   showStatus(now);
+  fill(now);
   get("go-form", HTMLFormElement).hidden = !now.may_go;
   button("go").textContent = now.state === "ready" ? "Go" : "Go again";
   box("understood").hidden = box("tools").hidden = box("help").hidden = !understood;
@@ -88,14 +102,13 @@ export const showJob = () => {
     box("notes").replaceChildren(...notes.map((text) => make("li", {}, text)));
     const sheet = get("sheet", HTMLAnchorElement);
     sheet.href = `/jobs/${now.id}/sheet.png`;
-    sheet.hidden = !understood.views.length;
+    sheet.hidden = box("photos-title").hidden = button("show-cameras").hidden = !understood.views.length;
   } else {
     showPanes(0, { center: [0, 0, 0], radius: 1, up: [0, 0, 1], views: [], notes: [], warnings: [], format: "", masks: "" });
   }
-  box("result").hidden = busy || now.samples.length === 0;
-  box("film-tools").hidden = busy || now.samples.length === 0;
+  box("result").hidden = box("film-tools").hidden = busy || now.samples.length === 0;
   box("downloads").replaceChildren(...now.samples.map((_, i) => make("li", {}, seedOf(now, i, ": ").replace("s", "S"),
-    ...now.formats.map((format) => make("a", { href: `/jobs/${now.id}/samples/${i}.${format}`, download: "", "aria-label": `${seedOf(now, i, "") || "Gaussians"} as .${format}` }, `.${format}`)))));
+    ...now.formats.map((format) => make("a", { href: `/jobs/${now.id}/samples/${i}.${format}`, download: "", title: USES[format] ?? "", "aria-label": `${seedOf(now, i, "") || "Gaussians"} as .${format}` }, `.${format}`)))));
   if (!busy && now.samples.length) void results(now);
   offerEdit();
 };
@@ -109,15 +122,15 @@ const photos = (now, understood) => {
   if (list.dataset.key === key) return;
   list.dataset.key = key;
   list.replaceChildren(...understood.views.map((photo, k) => {
-    const about = `mask ${(100 * photo.covers).toFixed(0)} %, agrees ${(100 * photo.agreement).toFixed(0)} %${photo.cut_off ? ", cut off" : ""}${photo.edited ? ", edited" : ""}${photo.shown ? "" : ", only for refinement"}`;
-    const see = make("button", { type: "button", class: "look", "aria-pressed": String(app.looking === k), "aria-label": `Photo ${k + 1}, ${photo.name}: look through its camera` },
+    const about = `mask ${(100 * photo.covers).toFixed(0)} %, agrees ${(100 * photo.agreement).toFixed(0)} %${photo.cut_off ? ", cut off" : ""}${photo.edited ? ", edited" : ""}${photo.shown ? "" : ", only for the optimization"}`;
+    const see = make("button", { class: "look", "aria-pressed": String(app.looking === k), "aria-label": `Photo ${k + 1}, ${photo.name}: look through its camera` },
       make("img", { class: "whole", alt: "", src: `/jobs/${now.id}/photos/${k}.png`, loading: "lazy" }),
       make("img", { class: "cut", alt: "", src: `/jobs/${now.id}/views/${k}.png?v=${photo.covers}`, loading: "lazy" }));
     see.addEventListener("click", () => {
       look(app.looking === k ? null : k);
       if (app.looking !== null) box("views").scrollIntoView({ block: "nearest" });
     });
-    const edit = make("button", { type: "button", "aria-label": `Edit the mask of photo ${k + 1}` }, "Edit mask");
+    const edit = make("button", { "aria-label": `Edit the mask of photo ${k + 1}` }, "Edit mask");
     edit.hidden = !now.may_go;
     edit.addEventListener("click", () => void attempt(() => openBrush(k, () => hooks.edited())));
     return make("li", {}, see, make("span", { class: "small" }, `${k + 1} ${photo.name}: ${about}`), edit);

@@ -1,11 +1,9 @@
 // All jobs: which one is shown, hearing of it, starting and cancelling it.
-/**
- * @typedef {import("./state.js").Status} Status
- */
-import { attempt, box, button, call, get, input, make, select } from "./dom.js";
+/** @typedef {import("./state.js").Status} Status */
+import { attempt, box, call, get, input, make, on, select } from "./dom.js";
 import { estimates } from "./gaussians.js";
 import { hooks, showJob, showStatus } from "./job.js";
-import { look, showPanes } from "./panes.js";
+import { look, showCameras, showPanes } from "./panes.js";
 import { app } from "./state.js";
 
 /** Time between two tries for a stream of events, where all of the server's are taken. */
@@ -22,6 +20,8 @@ export const reload = async (id) => {
   if (!wasHere) {
     showPanes(0, found.understood);
     look(null);
+    // Until there is something else to see.
+    showCameras(!found.samples.length && !found.estimate);
   }
   showJob();
   void estimates();
@@ -93,10 +93,8 @@ const listJobs = async () => {
   const all = await call("GET", "/jobs");
   box("no-jobs").hidden = all.length > 0;
   box("jobs").replaceChildren(...all.map((s) => {
-    const seen = !["reading", "failed", "interrupted"].includes(s.state) || s.id === app.job?.id;
-    const picture = make("img", { alt: "", loading: "lazy", width: "64", height: "64" });
-    if (seen) picture.src = `/jobs/${s.id}/thumbnail.png?v=${s.state}`;
-    const link = make("a", { href: `#job=${s.id}`, ...(s.id === app.job?.id ? { "aria-current": "true" } : {}) }, picture,
+    const picture = s.thumbnail ? [make("img", { alt: "", loading: "lazy", width: "64", height: "64", src: `/jobs/${s.id}/thumbnail.png?v=${s.state}` })] : [];
+    const link = make("a", { href: `#job=${s.id}`, title: s.error ?? "", ...(s.id === app.job?.id ? { "aria-current": "true" } : {}) }, ...picture,
       make("span", {}, make("b", {}, s.title || s.id), make("span", { class: "small" }, `${s.state}, ${new Date(1000 * s.created).toLocaleString()}`)));
     return make("li", {}, link);
   }));
@@ -106,17 +104,17 @@ get("go-form", HTMLFormElement).addEventListener("submit", (e) => {
   e.preventDefault();
   void attempt(async () => {
     if (!app.job) return;
-    const quality = select("quality").value, init = select("init").value, iterations = input("iterations").value;
-    const options = { samples: Number(input("samples").value), seed: Number(input("seed").value), ...(quality ? { quality } : {}), ...(init ? { init } : {}), ...(iterations === "" ? {} : { iterations: Number(iterations) }) };
+    const steps = input("iterations").value;
+    const options = { ...app.job.options, samples: Number(input("samples").value), seed: Number(input("seed").value), quality: select("quality").value || null, init: select("init").value || null, iterations: steps === "" ? null : Number(steps) };
     app.drawn = 0;
     document.body.dataset.estimates = "0";
     delete document.body.dataset.result;
     await call("POST", `/jobs/${app.job.id}/go`, JSON.stringify(options));
   });
 });
-button("cancel").addEventListener("click", () => void attempt(async () => {
+on("cancel", async () => {
   if (!app.job) return;
   await call("POST", `/jobs/${app.job.id}/cancel`);
   // This button is gone now.
   box("job-title").focus();
-}));
+});

@@ -21,6 +21,27 @@ export const repaint = () => {
 };
 dark.addEventListener("change", repaint);
 
+/** The sphere that the view shows: the object's, or one that the cameras stand on. @param {Understood} understood */
+const sphere = ({ center, radius, views }) => {
+  const far = views.map(({ camera: { world_to_camera: m } }) => Math.hypot(...center.map((v, i) => v + m[4 * i] * m[12] + m[4 * i + 1] * m[13] + m[4 * i + 2] * m[14])));
+  return /** @type {const} */ ([center, camerasShown ? Math.max(radius, ...far) : radius]);
+};
+
+/** Draws the cameras, and has them in sight; or the object alone. @param {boolean} shown */
+export const showCameras = (shown) => {
+  const understood = app.job?.understood;
+  if (shown === camerasShown) return;
+  camerasShown = shown;
+  button("show-cameras").setAttribute("aria-pressed", String(shown));
+  if (!understood) return;
+  look(null);
+  for (const { viewer } of app.panes) {
+    const { azimuth, elevation } = viewer.orbit;
+    viewer.frameSphere(...sphere(understood));
+    Object.assign(viewer.orbit, { azimuth, elevation });
+  }
+};
+
 /**
  * One picture per sample; they turn together.
  * @param {number} count
@@ -36,7 +57,7 @@ export const showPanes = (count, understood) => {
     box("views").append(figure);
     const viewer = new Viewer(canvas, { up: understood.up, background: back() });
     viewer.setGaussians(new Float32Array(0));
-    viewer.frameSphere(understood.center, understood.radius);
+    viewer.frameSphere(...sphere(understood));
     const pane = { viewer, figure, stage, photo, over, caption };
     viewer.onmove = () => follow(pane);
     viewer.ondraw = () => sketch(pane);
@@ -60,17 +81,14 @@ const follow = (leader) => {
   viewed.dispatchEvent(new Event("viewed"));
 };
 
-/**
- * The cameras around the object, and the object's sphere, as lines over the picture.
- * @param {Pane} pane
- */
+/** The cameras around the object, and the object's sphere, as lines over the picture. @param {Pane} pane */
 const sketch = (pane) => {
   const { over, viewer } = pane, understood = app.job?.understood, context = over.getContext("2d");
   if (!context) return;
   const [width, height] = viewer.size();
   if (over.width !== width || over.height !== height) Object.assign(over, { width, height });
   context.clearRect(0, 0, width, height);
-  if (!understood || !camerasShown || viewer.camera) return;
+  if (!understood || viewer.camera) return;
   const { right, down, forward, eye } = viewer.pose(), { focal, middle } = viewer.lens([width, height]);
   /** @param {number[]} p */
   const project = (p) => {
@@ -91,6 +109,23 @@ const sketch = (pane) => {
   };
   context.lineWidth = Math.max(1, width / 500);
   context.font = `${Math.round(Math.max(11, width / 45))}px system-ui`;
+  /**
+   * @param {string} text
+   * @param {number[]} at
+   */
+  const label = (text, at) => {
+    const place = project(at);
+    if (place) context.fillText(text, place[0] + 4, place[1] - 4);
+  };
+  if (app.crop) {
+    const ends = app.crop, corner = (/** @type {number} */ k) => [0, 1, 2].map((i) => ends[k >> i & 1][i]);
+    context.strokeStyle = context.fillStyle = "#d97a00";
+    for (const i of [0, 1, 2]) {
+      for (let k = 0; k < 8; k++) if (!(k >> i & 1)) line([corner(k), corner(k | 1 << i)]);
+      label("xyz"[i], corner(1 << i));
+    }
+  }
+  if (!camerasShown) return;
   understood.views.forEach((photo, k) => {
     const m = photo.camera.world_to_camera, c = photo.camera;
     const rows = [0, 1, 2].map((i) => [m[i], m[i + 4], m[i + 8]]), shift = [m[12], m[13], m[14]];
@@ -102,8 +137,7 @@ const sketch = (pane) => {
     context.setLineDash(photo.shown ? [] : [width / 120, width / 120]);
     line([...corners, corners[0]]);
     corners.forEach((corner) => line([at, corner]));
-    const label = project(at);
-    if (label) context.fillText(photo.shown ? String(k + 1) : `(${k + 1})`, label[0] + 4, label[1] - 4);
+    label(photo.shown ? String(k + 1) : `(${k + 1})`, at);
   });
   context.setLineDash([]);
   if (app.drawn === 0 && app.job?.samples.length === 0) {
@@ -120,10 +154,7 @@ const sketch = (pane) => {
   }
 };
 
-/**
- * Looks through the camera of a photo, or leaves it.
- * @param {?number} k
- */
+/** Looks through the camera of a photo, or leaves it. @param {?number} k */
 export const look = (k) => {
   const before = app.looking, photo = k === null ? undefined : app.job?.understood?.views[k];
   app.looking = photo ? k : null;
@@ -155,11 +186,7 @@ box("tools").addEventListener("click", (e) => {
   const name = e.target instanceof HTMLElement ? e.target.dataset.do : undefined;
   if (name && app.panes[0]) app.panes[0].viewer.do(name);
 });
-button("show-cameras").addEventListener("click", () => {
-  camerasShown = !camerasShown;
-  button("show-cameras").setAttribute("aria-pressed", String(camerasShown));
-  app.panes.forEach((pane) => pane.viewer.redraw());
-});
+button("show-cameras").addEventListener("click", () => showCameras(!camerasShown));
 const isDark = () => darkBack ?? dark.matches;
 const tellBackground = () => button("background").setAttribute("aria-pressed", String(isDark()));
 button("background").addEventListener("click", () => {

@@ -1,5 +1,5 @@
 // Pictures and films of the result: a screenshot, a turntable, the whole screen, turning by itself.
-import { attempt, box, button, complain, save, toolbar } from "./dom.js";
+import { box, button, complain, on, save, toolbar } from "./dom.js";
 import { gif } from "./gif.js";
 import { app } from "./state.js";
 
@@ -30,19 +30,19 @@ const turn = (on) => {
 };
 button("auto").addEventListener("click", () => turn(turning === undefined));
 
-button("full").addEventListener("click", () => void attempt(async () => {
+on("full", async () => {
   if (document.fullscreenElement) await document.exitFullscreen();
   else await box("views").requestFullscreen();
-}));
+});
 document.addEventListener("fullscreenchange", () => app.panes.forEach((pane) => pane.viewer.redraw()));
 
-button("shot").addEventListener("click", () => void attempt(async () => {
+on("shot", async () => {
   for (const [i, { viewer }] of app.panes.entries()) {
     viewer.draw(); // a picture lasts until its task ends
     const blob = await new Promise((/** @type {(b: ?Blob) => void} */ done) => viewer.canvas.toBlob(done));
     if (blob) save(blob, `${title()}-${i}.png`);
   }
-}));
+});
 
 /**
  * Has a button say how far its work is.
@@ -88,7 +88,7 @@ const film = async () => {
   });
 };
 button("film").hidden = !("MediaRecorder" in window) || !("captureStream" in HTMLCanvasElement.prototype);
-button("film").addEventListener("click", () => void attempt(film));
+on("film", film);
 
 /** The same as a GIF: smaller, of 256 colors, and every frame whole. */
 const animation = async () => {
@@ -111,11 +111,11 @@ const animation = async () => {
     save(gif(frames, width, height, Math.round(100 * FILM / FRAMES)), `${title()}.gif`);
   });
 };
-button("gif").addEventListener("click", () => void attempt(animation));
+on("gif", animation);
 
-button("link").addEventListener("click", () => void attempt(async () => {
+on("link", async () => {
   // Pages without encryption have no clipboard.
   const copied = await navigator.clipboard?.writeText(location.href).then(() => true, () => false);
   complain(`The address of this object${copied ? " is copied" : `: ${location.href}`}. Whoever opens it needs the token of this server.`);
-}));
+});
 toolbar(box("film-tools"));

@@ -1,5 +1,5 @@
 // A job gets another title, is removed, and is brought back.
-import { attempt, box, button, call, get, input } from "./dom.js";
+import { attempt, box, button, call, get, input, on } from "./dom.js";
 import { leave, reload } from "./jobs.js";
 import { app } from "./state.js";
 
@@ -27,7 +27,7 @@ button("remove").addEventListener("click", () => {
 button("remove-no").addEventListener("click", () => removing.close());
 /** @type {?string} */
 let removed = null;
-button("remove-yes").addEventListener("click", () => void attempt(async () => {
+on("remove-yes", async () => {
   removing.close();
   if (!app.job) return;
   const { id, title } = app.job;
@@ -39,12 +39,12 @@ button("remove-yes").addEventListener("click", () => void attempt(async () => {
   // The focused button is gone: what one may want next has the focus.
   button("undo").focus();
   location.hash = "";
-}));
-button("undo").addEventListener("click", () => void attempt(async () => {
+});
+on("undo", async () => {
   if (!removed) return;
   await call("POST", `/jobs/${removed}/restore`);
   box("removed").hidden = true;
   location.hash = `job=${removed}`;
   removed = null;
   box("main").focus();
-}));
+});

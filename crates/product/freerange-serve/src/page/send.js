@@ -1,8 +1,6 @@
 // New jobs: files that are chosen or dropped, what the server takes of them, and how far they are.
-/**
- * @typedef {{path: string, file: File}} Picked
- */
-import { attempt, box, button, complain, get, input, select } from "./dom.js";
+/** @typedef {{path: string, file: File}} Picked */
+import { attempt, box, button, complain, get, input, on, select } from "./dom.js";
 import { app } from "./state.js";
 
 const OF_USE = /\.(png|jpe?g|webp|json|bin|txt|xml|csv)$/i;
@@ -19,32 +17,34 @@ const UNREAD = /(^|\/)(images_[248]\/|points3D\.(bin|txt)$)/;
 /** @param {number} bytes */
 const megabytes = (bytes) => `${(bytes / 2 ** 20).toFixed(bytes < 10 * 2 ** 20 ? 1 : 0)} MB`;
 
-/** What the server takes is told before anyone chooses. */
-export const tellLimits = () => {
+const INSTALL = "Whoever runs this server can add one: pip install pycolmap, or apt install colmap.";
+
+/** What the server takes, and what it does by itself, is told before anyone chooses. */
+export const tellServer = () => {
+  for (const id of /** @type {const} */ (["quality", "init"])) {
+    const [first, ...others] = select(id).options, known = others.find((o) => o.value === app.defaults[id]);
+    if (known) first.text += ` (${known.text})`;
+  }
   const limits = app.limits;
   if (!limits) return;
   box("limits").textContent = `At most ${limits.files.toLocaleString("en")} files, ${megabytes(limits.bytes)} together, `
     + `${Math.round(limits.pixels / 1e6)} megapixels a photo. Photos are used at ${limits.side} pixels at most.`;
   const { name, missing } = app.finder;
-  box("finder").textContent = name ? `Photos without cameras: ${name} finds the cameras, which takes minutes.` : `Photos need cameras; ${missing}.`;
+  box("bare").hidden = !name;
+  box("finder").textContent = name ? `Photos without cameras: ${name} finds the cameras, which takes minutes.` : `Photos need cameras; ${missing}. ${INSTALL}`;
 };
 
-/**
- * What can be sent of these files; an error where that is nothing, or more than the server takes.
- * @param {Picked[]} picked
- */
+/** What can be sent of these files; an error where that is nothing, or more than the server takes. @param {Picked[]} picked */
 const chosenOf = (picked) => {
   const seen = picked.filter(({ path }) => !path.split("/").some((part) => part.startsWith(".")));
-  const fine = seen.filter(({ path }) => OF_USE.test(path) && !UNREAD.test(path)), others = seen.filter(({ path }) => OTHERS.test(path));
-  if (others.length && !fine.some(({ path }) => PHOTO.test(path))) {
-    throw new Error(`${others.length} photos are ${others[0].path.split(".").pop()?.toUpperCase()} files, which cannot be read here: save them as JPEG or PNG`);
+  const others = seen.filter(({ path }) => OTHERS.test(path));
+  let fine = seen.filter(({ path }) => OF_USE.test(path) && !UNREAD.test(path));
+  if (!fine.some(({ path }) => PHOTO.test(path))) {
+    if (others.length) throw new Error(`${others.length} photos are ${others[0].path.split(".").pop()?.toUpperCase()} files, which cannot be read here: save them as JPEG or PNG`);
+    fine = seen.filter(({ path }) => SPLATS.test(path));
+    if (!fine.length) throw new Error("no photo and no file of Gaussians is among these files. Photos are .jpg, .png or .webp, with their cameras; Gaussians .ply, .splat, .spz, .sog, .glb, .usda, .usdz or .html.");
+    if (fine.length > 1) throw new Error(`these are ${fine.length} files of Gaussians: one at a time`);
   }
-  if (!fine.length) {
-    const splats = seen.filter(({ path }) => SPLATS.test(path));
-    if (splats.length > 1) throw new Error(`these are ${splats.length} files of Gaussians: one at a time`);
-    fine.push(...splats);
-  }
-  if (!fine.length) throw new Error("no photos and no cameras are among these files");
   const limits = app.limits, bytes = fine.reduce((sum, { file }) => sum + file.size, 0);
   if (limits && fine.length > limits.files) throw new Error(`these are ${fine.length} files: this server takes at most ${limits.files}`);
   if (limits && bytes > limits.bytes) throw new Error(`these files have ${megabytes(bytes)}: this server takes at most ${megabytes(limits.bytes)}`);
@@ -111,7 +111,10 @@ const search = async (fine) => {
   const photos = fine.filter(({ path }) => PHOTO.test(path) && !/(^|\/)masks\//.test(path));
   if (!photos.length || fine.some(({ path }) => CAMERAS.test(path)) || input("scene-turntable").value.trim()) return {};
   const what = photos.length === 1 ? "This photo has no camera" : `These ${photos.length} photos have no cameras`, { name, missing } = app.finder;
-  if (!name) throw new Error(`${what}, and ${missing}`);
+  if (!name) {
+    get("reading", HTMLDetailsElement).open = true;
+    throw new Error(`${what}, and ${missing}. Turntable is under “How the photos are read”, which is open now. ${INSTALL}`);
+  }
   box("cameras-text").textContent = `${what}. ${name} can look for them on this server, which takes minutes.`;
   asking.showModal();
   const yes = await new Promise((/** @type {(yes: boolean) => void} */ done) => { answered = done; });
@@ -151,11 +154,11 @@ const send = async (picked) => {
 export const offerExample = (name) => {
   button("example").hidden = false;
   button("example").textContent = `Take the example (${name})`;
-  button("example").addEventListener("click", () => void attempt(async () => {
+  on("example", async () => {
     const form = new FormData();
     form.append("example", name);
     await post(form);
-  }));
+  });
 };
 
 /** @param {HTMLInputElement} element */

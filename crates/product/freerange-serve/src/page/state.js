@@ -5,8 +5,9 @@
  * @typedef {{center: number[], radius: number, up: number[], views: Photo[], notes: string[], warnings: string[], format: string, masks: string}} Understood
  * @typedef {{number: number, stage: string, parts: {sample: number, gaussians: number}[]}} Estimate
  * @typedef {{id: string, title: string, created: number, state: string, error: ?string, position: ?number, stage: ?string, sample: number, done: number,
- *   total: number, loss: ?number, estimate: ?Estimate, version: number}} Status
- * @typedef {Status & {understood: ?Understood, options: {samples: ?number, seed: ?number}, passed_over: string[], notes: string[],
+ *   total: number, loss: ?number, estimate: ?Estimate, thumbnail: boolean, version: number}} Status
+ * @typedef {{samples?: ?number, seed?: ?number, quality?: ?string, init?: ?string, iterations?: ?number}} Options
+ * @typedef {Status & {understood: ?Understood, options: Options, passed_over: string[], notes: string[],
  *   seconds: [string, number][], samples: {seed: number, gaussians: number}[], up: number[], may_go: boolean, formats: string[]}} Job
  * @typedef {{viewer: Viewer, figure: HTMLElement, stage: HTMLElement, photo: HTMLImageElement, over: HTMLCanvasElement, caption: HTMLElement}} Pane
  * @typedef {{bytes: number, file_bytes: number, files: number, pixels: number, job_pixels: number, side: number}} Limits
@@ -23,6 +24,10 @@ export const app = {
   drawn: 0,
   /** @type {?Limits} What the server takes. */
   limits: null,
+  /** @type {Options} What jobs have that choose nothing, as far as it is known. */
+  defaults: {},
+  /** @type {?number[][]} The box that a result is cropped to: its lowest and its highest corner. */
+  crop: null,
   /** @type {{name?: string, missing?: string}} What finds the cameras of photos that have none, or why nothing does. */
   finder: {},
 };

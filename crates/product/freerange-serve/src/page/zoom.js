@@ -10,10 +10,7 @@ export class Zoom {
   /** @param {number[]} size of the image in pixels */
   constructor(size) { this.size = size; }
 
-  /**
-   * Where a place of the canvas lies in the image; both in pixels.
-   * @param {number[]} at
-   */
+  /** Where a place of the canvas lies in the image; both in pixels. @param {number[]} at */
   inside(at) { return at.map((v, i) => this.corner[i] + v / this.scale); }
 
   /**
@@ -35,16 +32,10 @@ export class Zoom {
     this.pan([0, 0]);
   }
 
-  /**
-   * Moves what is seen, in pixels of the image; nothing beside it is shown.
-   * @param {number[]} by
-   */
+  /** Moves what is seen, in pixels of the image; nothing beside it is shown. @param {number[]} by */
   pan(by) { this.corner = this.corner.map((v, i) => Math.max(0, Math.min(this.size[i] * (1 - 1 / this.scale), v + by[i]))); }
 
-  /**
-   * Brings a place of the image into sight.
-   * @param {number[]} place
-   */
+  /** Brings a place of the image into sight. @param {number[]} place */
   follow(place) {
     this.pan(place.map((v, i) => {
       const seen = this.size[i] / this.scale, edge = seen / 10, low = this.corner[i] + edge, high = this.corner[i] + seen - edge;

@@ -19,8 +19,8 @@ use freerange_gaussians::{Gaussians, channel};
 use freerange_scene::camera::{Camera, View};
 use freerange_scene::estimate::LeaveOneOut;
 use freerange_serve::{
-    Engine, EngineError, Example, FoundCameras, JobOptions, Outcome, Scene, Search, SearchStep, ServeConfig, Server,
-    Step, Stopper,
+    Engine, EngineError, Example, FoundCameras, JobOptions, Outcome, Quality, Scene, Search, SearchStep, ServeConfig,
+    Server, Step, Stopper,
 };
 use image::RgbaImage;
 use serde_json::Value;
@@ -98,6 +98,10 @@ impl Fake {
 impl Engine for Fake {
     fn name(&self) -> String {
         "a cloud that moves".into()
+    }
+
+    fn defaults(&self) -> JobOptions {
+        JobOptions { quality: Some(Quality::Draft), ..JobOptions::default() }
     }
 
     fn choose(&self, views: &[View]) -> Result<Vec<usize>, String> {
