@@ -1,6 +1,11 @@
-//! What keeps an optimization where no photo looks: pictures of the cloud as it was before.
+//! What keeps an optimization where no photo looks, and shows from there what photos see: pictures of the proposals from around.
 
-use crate::{AnchorConfig, FitError, objective::Objective};
+use crate::{
+    AnchorConfig, FitError,
+    objective::Objective,
+    reproject::{Reprojected, reprojected},
+    views::Targets,
+};
 use freerange_gaussians::Gaussians;
 use freerange_raster::{RasterConfig, render, render_backward};
 use freerange_scene::camera::Camera;
@@ -14,6 +19,8 @@ const FILLED: f64 = 0.9;
 const HIGHEST: f64 = 0.9;
 /// Pictures are compared as small ones that stand for images of so many pixels a side.
 const FULL_SIZE: f32 = 512.0;
+/// Alpha of pixels that may have a photo's color.
+const SOLID: f32 = 0.9;
 /// Differences of colors that are rounding.
 const EQUAL: f32 = 1e-6;
 
@@ -45,23 +52,28 @@ fn around(views: usize, size: u32, radius: f64) -> impl Iterator<Item = Camera> 
 }
 
 impl Anchors {
-    /// The mean pictures of `clouds`; none where they would have no weight.
-    pub fn new(clouds: &[Gaussians], config: &AnchorConfig) -> Result<Self, FitError> {
+    /// The mean pictures of `clouds`, in the colors of `photos` where these see the surface; none where they would have no weight.
+    pub fn new(clouds: &[Gaussians], photos: &Targets, config: &AnchorConfig) -> Result<Self, FitError> {
         let raster = RasterConfig::default().shrunk(config.size as f32 / FULL_SIZE);
-        let pixels = (config.size * config.size) as usize;
+        let wanted = if config.weight > 0.0 { usize::MAX } else { 0 };
+        let cameras: Vec<Camera> = around(config.views, config.size, config.radius).take(wanted).collect();
+        let shown = reprojected(&cameras, &raster, clouds, photos)?;
         let share = 1.0 / clouds.len() as f32;
-        let picture = |camera| {
+        let picture = |(camera, shown): (Camera, Reprojected)| {
+            let pixels = shown.trust.len();
             let (mut rgb, mut alpha) = (vec![0.0; 3 * pixels], vec![0.0; pixels]);
             for cloud in clouds {
                 let out = render(cloud.rows(), &[camera], &[[0.0; 3]], &raster)?;
                 rgb.iter_mut().zip(&out.rgb).for_each(|(sum, x)| *sum += share * x);
                 alpha.iter_mut().zip(&out.alpha).for_each(|(sum, x)| *sum += share * x);
             }
+            for (i, held) in rgb.as_chunks_mut::<3>().0.iter_mut().enumerate().filter(|(i, _)| alpha[*i] >= SOLID) {
+                let (color, trust) = (shown.color[i], shown.trust[i]);
+                held.iter_mut().zip(color).for_each(|(held, color)| *held += trust * (alpha[i] * color - *held));
+            }
             Ok(Picture { camera, rgb, alpha })
         };
-        let wanted = if config.weight > 0.0 { usize::MAX } else { 0 };
-        let cameras = around(config.views, config.size, config.radius);
-        let pictures = cameras.take(wanted).map(picture).collect::<Result<_, FitError>>()?;
+        let pictures = cameras.into_iter().zip(shown).map(picture).collect::<Result<_, FitError>>()?;
         let (weight, every) = (config.weight * config.every as f64, config.every);
         Ok(Self { pictures, raster, weight, every })
     }

@@ -26,6 +26,7 @@ mod mirror;
 mod objective;
 mod optimize;
 mod quality;
+mod reproject;
 mod search;
 #[cfg(test)]
 mod tests;

@@ -20,7 +20,8 @@ const SILHOUETTES: u32 = 128;
 /// Few views say little of the rest of the object, and Gaussians that only they judge leave the object's surface. Hence
 /// [anchors](crate::AnchorConfig): at every other step, a picture of the cloud as it was, from somewhere around the object, is one
 /// more view to agree with, though less. `others` are more clouds of the same object. These pictures are the mean of all:
-/// where guesses differ, their mean is nearer to the truth than most. For the same reason the optimization begins with as many
+/// where guesses differ, their mean is nearer to the truth than most. Where photos see the surface that the clouds show, the pictures
+/// have the photos' colors: print then lies on that surface from everywhere. As guesses differ, the optimization begins with as many
 /// of them in one place as there are to be Gaussians, each fainter, so that together they show about what one alone does.
 /// Silhouettes, where there are any, come beside the views at every other step.
 /// `progress` hears of every step, and ends with what there is by `ControlFlow::Break`. The same input gives the same bytes.
@@ -45,7 +46,7 @@ pub fn optimize<'a>(
     let silhouettes = (further > 0).then(|| Targets::new(seen, Some(size))).transpose()?;
     let clouds = std::iter::once(cloud).chain(others).map(|cloud| checked(cloud, usize::MAX));
     let clouds = clouds.collect::<Result<Vec<_>, _>>()?;
-    let anchors = Anchors::new(&clouds, &config.anchors)?;
+    let anchors = Anchors::new(&clouds, coarse.as_ref().unwrap_or(&targets), &config.anchors)?;
     let start = together(&clouds, config.gaussians);
     let fit = config.fit(start.len());
     fit.check()?;

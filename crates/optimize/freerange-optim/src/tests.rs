@@ -314,7 +314,8 @@ fn small_anchors() -> AnchorConfig {
 
 #[test]
 fn anchors_weigh_as_much_however_seldom_they_are_looked_at() {
-    let at = |every| Anchors::new(&[ball(12, 1)], &AnchorConfig { every, ..small_anchors() }).unwrap();
+    let photos = Targets::new(&ring(4, 32, &ball(12, 1)), None).unwrap();
+    let at = |every| Anchors::new(&[ball(12, 1)], &photos, &AnchorConfig { every, ..small_anchors() }).unwrap();
     let loss = |anchors: &Anchors| anchors.objective(&ball(12, 2), 3, [0.2; 3]).unwrap().loss;
     for every in [1, 2, 3] {
         let anchors = at(every);
@@ -323,6 +324,33 @@ fn anchors_weigh_as_much_however_seldom_they_are_looked_at() {
     }
     // Silhouettes come at even steps.
     assert!(at(2).due(1) && !at(2).due(2));
+}
+
+#[test]
+fn anchors_have_the_photos_colors() {
+    // A solid ball, gray, of which photos from all around say that it is red.
+    let solid = |color: [f32; 3]| {
+        let mut rows = Vec::new();
+        let along = || (-5..=5).map(|i| f64::from(i) * 0.06);
+        for (x, y, z) in along().flat_map(|x| along().flat_map(move |y| along().map(move |z| (x, y, z)))) {
+            let mean = DVec3::new(x, y, z);
+            if mean.length() < 0.31 {
+                let mut row = [0.0; channel::COUNT];
+                row[channel::MEAN].copy_from_slice(&mean.as_vec3().to_array());
+                row[channel::LOG_SCALE].fill(-3.0);
+                row[channel::ROTATION][0] = 1.0;
+                row[channel::LOGIT_OPACITY] = 6.0;
+                row[channel::COLOR].copy_from_slice(&color);
+                rows.extend(row);
+            }
+        }
+        Gaussians::from_rows(rows)
+    };
+    let [gray, red] = [[0.5; 3], [0.9, 0.1, 0.1]].map(solid);
+    let photos = Targets::new(&ring(8, 96, &red), None).unwrap();
+    let anchors = Anchors::new(std::slice::from_ref(&gray), &photos, &small_anchors()).unwrap();
+    let loss = |cloud| (0..6).map(|view| anchors.objective(cloud, view, [0.0; 3]).unwrap().loss).sum::<f64>();
+    assert!(loss(&red) < 0.5 * loss(&gray), "{} {}", loss(&red), loss(&gray));
 }
 
 #[test]

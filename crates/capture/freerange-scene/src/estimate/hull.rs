@@ -112,7 +112,7 @@ impl Nearly {
     }
 
     /// The points that one of `count` views excludes, by its number, and those that two do, by theirs in order.
-    pub fn excluded(&self, count: usize) -> (Vec<Vec<DVec3>>, HashMap<[usize; 2], Vec<DVec3>>) {
+    pub fn excluded(&self, count: usize) -> (Vec<Vec<DVec3>>, OfPairs) {
         let (mut one, mut two) = (vec![Vec::new(); count], HashMap::<_, Vec<DVec3>>::new());
         for (point, without) in &self.points {
             match *without {
@@ -129,6 +129,9 @@ impl Nearly {
         Hull { points, step: self.step }
     }
 }
+
+/// Points of each pair of views, by their numbers in order.
+pub type OfPairs = HashMap<[usize; 2], Vec<DVec3>>;
 
 /// The hull of some masks, sampled.
 pub struct Hull {

@@ -248,7 +248,8 @@ pub fn cameras_with(path: &Path, config: &ReadConfig) -> Result<Cameras, SceneEr
             Some("opf") => Format::Opf,
             Some("bin" | "txt") if colmap::is_one(path) => Format::Colmap,
             _ => {
-                let expected = "a folder, a file .json, .xml, .csv or .opf, or COLMAP's cameras or images, .bin or .txt";
+                let expected =
+                    "a folder, a file .json, .xml, .csv or .opf, or COLMAP's cameras or images, .bin or .txt";
                 return Err(In(path).field("", "file name", expected, path.display()));
             }
         };
