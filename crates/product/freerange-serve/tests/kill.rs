@@ -165,7 +165,7 @@ impl Watched {
             let width = x(to) - x(from);
             svg +=
                 &format!("<rect x=\"{:.1}\" y=\"20\" width=\"{width:.1}\" height=\"180\" fill=\"#eee\"/>\n", x(from));
-            svg += &text(x(from) + width / 2.0, 14.0, "middle", "disk full".into());
+            svg += &text(x(from) + width / 2.0, 34.0, "middle", "disk full".into());
         }
         for kill in &self.kills {
             let at = x(*kill);
