@@ -44,7 +44,7 @@ pub(crate) fn reprojected(
     photos: &Targets,
 ) -> Result<Vec<Reprojected>, FitError> {
     let mut seen = cameras.iter().map(|camera| Points::new(camera, raster, sets)).collect::<Result<Vec<_>, _>>()?;
-    let asked = photos.views.min(MOST_PHOTOS);
+    let asked = if cameras.is_empty() { 0 } else { photos.views.min(MOST_PHOTOS) };
     for i in (0..asked).map(|k| k * photos.views / asked) {
         let photo = Photo::new(photos, i, sets)?;
         seen.par_iter_mut().for_each(|points| points.look(&photo));
@@ -52,8 +52,8 @@ pub(crate) fn reprojected(
     Ok(seen.into_iter().map(Points::colors).collect())
 }
 
-/// Camera z of the surface, `[height, width]`, as the mean of the sets; infinite where less than half of them have one. And the
-/// standard deviation.
+/// Camera z of the surface, `[height, width]`, as the mean of the sets; infinite where no more than half of them have one. And
+/// the standard deviation.
 fn depths(camera: &Camera, raster: &RasterConfig, sets: &[Gaussians]) -> Result<Vec<(f64, f64)>, FitError> {
     let all = sets.iter().map(|set| surface_depth(set.rows(), camera, raster)).collect::<Result<Vec<_>, _>>()?;
     let of_pixel = |i: usize| {
