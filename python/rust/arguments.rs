@@ -137,6 +137,7 @@ impl RawOptions {
             set: self.set,
         };
         let mut options = model.options_of(&choices).map_err(crate::error::of_model)?;
+        choices.check_effect(&options.pipeline, false).map_err(crate::error::of_model)?;
         options.seeds = self.seeds;
         Ok(options)
     }

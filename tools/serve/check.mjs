@@ -412,7 +412,8 @@ try {
   await until(`window.viewers[0].count === ${all} && document.getElementById('edit-undo').disabled`);
   await click("#edit-tidy");
   await until("!document.getElementById('edit-undo').disabled");
-  told("floaters", `${all - await evaluate("window.viewers[0].count")} Gaussians`);
+  const loose = all - await evaluate("window.viewers[0].count");
+  told("floaters", `${loose} Gaussians`);
   await click("#edit-undo");
   await until(`window.viewers[0].count === ${all} && document.getElementById('edit-undo').disabled`);
   check("undo of an edit", true, await evaluate("document.getElementById('edit-text').textContent"));
@@ -549,6 +550,19 @@ try {
   check("the form has the job's settings", settings === "2,0,60", settings);
   await picture("interrupted");
 
+  // A tab that nobody sees leaves its connection to others.
+  const streams = async () => Number(/^freerange_streams (\d+)/m.exec((await get("/metrics")).toString())[1]);
+  const hide = (hidden) => evaluate(`Object.defineProperty(document, "hidden", { value: ${hidden}, configurable: true }); document.dispatchEvent(new Event("visibilitychange"))`);
+  const soon = async (count) => {
+    for (let i = 0; i < 300 && await streams() !== count; i++) await wait(100);
+    return streams();
+  };
+  const open = await soon(1);
+  await hide(true);
+  const hidden = await soon(0);
+  await hide(false);
+  check("streams of a hidden tab", open === 1 && hidden === 0 && await soon(1) === 1, `${open}, hidden ${hidden}, ${await streams()}`);
+
   // A file of Gaussians is shown, and offered in every format.
   // Anywhere on the page.
   const one = { items: [], files: [ply], dragOperationsMask: 1 };
@@ -559,6 +573,27 @@ try {
   check("a dropped file of Gaussians", await evaluate("document.querySelectorAll('#downloads a').length") === job.formats.length, await evaluate("document.getElementById('notes').textContent"));
   await accessible("with a file of Gaussians");
   await picture("splats");
+
+  // Three Gaussians far from all others are floaters, and nothing else of it is.
+  const whole = readFileSync(ply), top = whole.indexOf("end_header\n") + 11, row = (whole.length - top) / all;
+  const away = [5, 6, 7].map((place) => {
+    const one = Buffer.from(whole.subarray(top, top + row));
+    [0, 1, 2].forEach((axis) => one.writeFloatLE(place, 4 * axis));
+    return one;
+  });
+  const floating = join(folder, "floating.ply"), last = await evaluate("location.hash.slice(5)");
+  writeFileSync(floating, Buffer.concat([Buffer.from(whole.subarray(0, top).toString("latin1").replace(`element vertex ${all}\n`, `element vertex ${all + 3}\n`), "latin1"), whole.subarray(top), ...away]));
+  for (const type of ["dragEnter", "dragOver", "drop"]) await send("Input.dispatchDragEvent", { type, x, y, data: { ...one, files: [floating] } });
+  await until(`location.hash.slice(5) !== ${JSON.stringify(last)} && document.body.dataset.result === location.hash.slice(5) && window.viewers[0]?.count === ${all + 3}`, 60);
+  await evaluate("document.getElementById('edit').open = true");
+  await until(`document.getElementById('edit-text').textContent.includes(' of ')`);
+  // The first step of a slider leaves them out, however far away they are.
+  await evaluate("(() => { const to = document.getElementById('to-0'); to.value = 99; to.dispatchEvent(new Event('input')); })()");
+  const within = await evaluate("window.viewers[0].count");
+  check("sliders span the object", within > 0.9 * all && within <= all, `${within} of ${all} and three far away`);
+  await click("#edit-tidy");
+  await until("!document.getElementById('edit-undo').disabled");
+  check("floaters", await evaluate("window.viewers[0].count") === all - loose, `${await evaluate("window.viewers[0].count")} of ${all + 3}, ${loose} of them loose before`);
   const left = ended(program);
   program.kill("SIGTERM");
   check("asked to end", await Promise.race([left, wait(20_000).then(() => "still there")]) === 0, "exit code 0");

@@ -191,8 +191,15 @@ impl PipelineArgs {
         }
     }
 
-    /// The model's own pipeline, with what the user chooses.
+    /// The model's own pipeline, with what the user chooses, all of which has an effect.
     pub fn options(&self, model: &Reconstructor, samples: u32) -> Result<Options, CliError> {
+        let options = self.options_of_jobs(model, samples)?;
+        self.choices().check_effect(&options.pipeline, self.init_file().is_some())?;
+        Ok(options)
+    }
+
+    /// The same for jobs that choose further: what has no effect on one of them has an effect on another.
+    pub fn options_of_jobs(&self, model: &Reconstructor, samples: u32) -> Result<Options, CliError> {
         let mut options = model.options_of(&self.choices())?;
         options.seeds = (0..u64::from(samples)).map(|i| self.seed.wrapping_add(i)).collect();
         options.frame.up = self.up.or_z();

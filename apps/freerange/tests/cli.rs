@@ -65,6 +65,14 @@ fn refused(scene: &Path, extra: &[&str], words: &[&str]) {
 }
 
 #[test]
+fn the_short_help_of_the_main_job_fits_a_screen() {
+    let text = String::from_utf8(freerange(&["reconstruct", "-h"]).stdout).unwrap();
+    let options = text.lines().filter(|line| line.trim_start().starts_with('-')).count();
+    assert!(text.lines().count() <= 50 && options <= 16, "{} lines, {options} options", text.lines().count());
+    assert!(text.contains("Examples") || text.contains("examples"), "{text}");
+}
+
+#[test]
 fn help_and_version() {
     for args in [&["--help"][..], &["--version"], &["reconstruct", "--help"], &["data", "--help"], &["train", "--help"]]
     {
@@ -321,6 +329,14 @@ fn bad_numbers_on_the_command_line() {
     refused(Path::new("no/such/scene"), &["--set", "count"], &["KEY=VALUE"]);
     // One proposal alone is used where nothing is optimized.
     refused(Path::new("no/such/scene"), &["--set", "propose.count=2"], &["propose.count", "optimization"]);
+    for (options, field, with) in [
+        (&["--set", "propose.flow.cfg_scale=1.5"][..], "propose.flow.cfg_scale", "propose.init: flow"),
+        (&["--set", "symmetry.reflection_threshold=1"], "reflection_threshold", "detect: auto"),
+        (&["--set", "optimize.max_resolution=256"], "optimize.max_resolution", "optimize.iterations"),
+        (&["--set", "propose.count=1", "--init", "x.ply"], "propose.count", "Gaussians"),
+    ] {
+        refused(Path::new("no/such/scene"), options, &[field, "no effect", with]);
+    }
     let done = freerange(&["train", "tiny", "-o", "no/such/run", "--save-every", "0"]);
     let message = String::from_utf8_lossy(&done.stderr).into_owned();
     assert_eq!(done.status.code(), Some(2), "{message}");

@@ -116,7 +116,7 @@ struct Watch {
 impl Watch {
     fn at(&mut self, p: &freerange::Progress<'_>) {
         let label = match p.stage {
-            Stage::Canonicalize if p.total > 1 => "finding the object",
+            Stage::Canonicalize if p.total > 1 => "initial fits",
             Stage::Symmetry => "looking for symmetry",
             Stage::Propose => "proposing",
             Stage::Refine => "refining",

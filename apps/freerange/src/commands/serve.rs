@@ -144,7 +144,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
         let text = format!("--init: expected fit or flow for jobs of many objects, found {}", file.display());
         return Err(CliError::input(text));
     }
-    args.pipeline.options(&model, 1)?;
+    args.pipeline.options_of_jobs(&model, 1)?;
     let place = match &args.pipeline.checkpoint {
         // Where it lies is nobody's business.
         Some(path) => path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned(),

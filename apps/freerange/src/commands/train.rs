@@ -22,7 +22,7 @@ use freerange_train::{
 };
 use freerange_util::sha256_of;
 
-use freerange_model::{Compute, Execution, FreeRange, ModelConfig, ModelInfo, Workload};
+use freerange_model::{Execution, FreeRange, ModelConfig, ModelInfo, Workload};
 
 use self::{interrupt::Interrupt, journal::Journal, run::Run};
 use crate::{
@@ -103,9 +103,6 @@ fn train(args: &Args, job: &Job, interrupt: &Arc<Interrupt>, begin: Instant) -> 
         Some(output) if !args.dry_run => output,
         _ => return job.together(if job.first() { dry_run(&config, device) } else { Ok(()) }),
     };
-    if config.optimizer.compute == Compute::Auto {
-        say(&format!("computing in {}", config.optimizer.compute.on(device)));
-    }
     let ranks = job.sums(args.sums, device)?;
     let total = config.total_steps();
     let encoders = EncoderPlaces::at(args.encoder_weights.clone());

@@ -133,7 +133,8 @@ fn answer(site: &Site, request: &mut Request) -> Answer {
         }
         (_, ["jobs", id, "samples", rest @ ..]) => samples(board, request, id, rest),
         ("PUT", ["jobs", id, "masks", k]) => {
-            let png = request.body(MASK)?;
+            board.folder(id)?;
+            let (png, _held) = held_body(board, request, MASK)?;
             let covers = board.edit_mask(id, number(k, PHOTOS)?, &png)?;
             Ok(Response::json(&json!({ "covers": covers })))
         }
@@ -237,6 +238,13 @@ fn body<T: serde::de::DeserializeOwned + Default>(request: &mut Request) -> Resu
     serde_json::from_slice(&bytes).map_err(|e| Refusal::new(422, format!("body: {e}")))
 }
 
+/// A body of at most so many bytes, and the memory that it takes: many that arrive slowly may not take all there is.
+fn held_body(board: &Arc<Board>, request: &mut Request, most: u64) -> Result<(Vec<u8>, Held), Refusal> {
+    request.at_most(most)?;
+    let held = Held::bytes(board, request.length)?;
+    Ok((request.body(most)?, held))
+}
+
 /// Takes the files of a new job, or the example.
 fn post(site: &Site, request: &mut Request) -> Answer {
     let board = &site.board;
@@ -320,7 +328,10 @@ fn samples(board: &Arc<Board>, request: &mut Request, id: &str, rest: &[&str]) -
             Ok(Response::new("application/octet-stream", Content::Bytes(bytes)).holding(held))
         }
         ("PUT", [i, "kept"]) => {
-            let (i, kept) = (number(i, 64)?, request.body(KEPT)?);
+            let i = number(i, 64)?;
+            drop(Held::take(board, id, i)?);
+            // A byte of it goes with many of the result, which are counted from here on.
+            let (kept, _) = held_body(board, request, KEPT)?;
             let _held = Held::take(board, id, i)?;
             Ok(Response::json(&json!({ "gaussians": board.keep(id, i, &kept)? })))
         }

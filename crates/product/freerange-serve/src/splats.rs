@@ -7,7 +7,7 @@ use freerange_gaussians::{
     formats::{Format, Frame, Frames, Loaded, WriteOptions, encode, parse},
 };
 use freerange_scene::camera::{Camera, Up};
-use freerange_util::{Stop, write_atomically};
+use freerange_util::{Stop, Stopped, write_atomically};
 use glam::DVec3;
 use image::RgbaImage;
 use serde_json::{Value, json};
@@ -34,6 +34,17 @@ fn memory_per_byte(format: Format) -> u64 {
     }
 }
 
+/// Whether to go on: between steps, none of which can be stopped itself.
+fn check(stop: &Stop, limits: &Limits) -> Result<(), Refusal> {
+    stop.check().map_err(|stopped| match stopped {
+        Stopped::Cancelled => Refusal::new(409, "cancelled"),
+        Stopped::Late => {
+            let most = limits.read_time.as_secs_f64();
+            Refusal::new(422, format!("reading this file took longer than {most} seconds, which is the limit"))
+        }
+    })
+}
+
 /// Reads the Gaussians of `file`, and writes them as the first sample of the job in `folder`, unless `stop` says otherwise by then. `up`
 /// overrides what the file says.
 pub fn prepare(file: &Path, folder: &Path, up: Option<Up>, limits: &Limits, stop: &Stop) -> Result<Found, Refusal> {
@@ -55,15 +66,17 @@ pub fn prepare(file: &Path, folder: &Path, up: Option<Up>, limits: &Limits, stop
     let frames = Frames { from: chosen, to: chosen };
     // From the bytes alone: whatever else the file names is not looked for.
     let bytes = fs::read(file).map_err(Refusal::file(file))?;
+    check(stop, limits)?;
     let name = Path::new(file.file_name().unwrap_or_default());
     let Loaded { splats, frame, notes } = parse(format, &bytes, name, frames).map_err(|e| refused(&chain(&e)))?;
     if splats.cloud.is_empty() {
         return Err(refused("there are no Gaussians in this file"));
     }
+    check(stop, limits)?;
     let options = WriteOptions { frame, ..WriteOptions::default() };
     let encoded = encode(&splats, Format::Ply, &options).map_err(|e| refused(&chain(&e)))?;
     // Who cancelled a job may have removed it since: its folder is elsewhere then.
-    stop.check().map_err(|_| Refusal::new(409, "cancelled"))?;
+    check(stop, limits)?;
     let sample = sample_file(folder, 0);
     write_atomically(&sample, |w| std::io::Write::write_all(w, &encoded.bytes)).map_err(Refusal::file(&sample))?;
     let (center, radius) = place(&splats.cloud);

@@ -101,6 +101,47 @@ fn large_results_on_their_way_take_no_more_memory_than_they_may() {
     }
 }
 
+/// V1.
+#[test]
+fn bodies_that_arrive_slowly_take_no_more_memory_than_they_may() {
+    let server = with(Limits { memory: 8 << 20, ..Limits::default() });
+    let ply = encode(&Splats::from(Fake::cloud(1, 1)), Format::Ply, &WriteOptions::default()).unwrap().bytes;
+    let id = posted(&server, &[Part::file("small.ply", ply)]);
+    server.until(&id, &["done"]);
+    let paths = [format!("/jobs/{id}/samples/0/kept"), format!("/jobs/{id}/masks/0")];
+    for path in &paths {
+        // What it is for has to be there before the first byte is read.
+        assert_eq!(server.begun(&path.replace(&id, "0123456789abcdef"), 5 << 20).status, 404, "{path}");
+        let mut slow = TcpStream::connect(server.address).unwrap();
+        let head = format!("PUT {path} HTTP/1.1\r\nHost: localhost\r\nContent-Length: {}\r\n\r\n1", 5 << 20);
+        slow.write_all(head.as_bytes()).unwrap();
+        let begin = Instant::now();
+        while server.get(&format!("/jobs/{id}/samples/0")).status != 200
+            || server.begun(&paths[0], 5 << 20).status != 503
+        {
+            assert!(begin.elapsed() < Duration::from_secs(30), "{path}: a second one is taken");
+            thread::sleep(Duration::from_millis(20));
+        }
+        assert_eq!(server.begun(&paths[1], 5 << 20).status, 503);
+        drop(slow);
+        let begin = Instant::now();
+        while server.send("PUT", &paths[0], "", b"1").status == 503 {
+            assert!(begin.elapsed() < Duration::from_secs(30), "its memory is never free again");
+            thread::sleep(Duration::from_millis(20));
+        }
+    }
+}
+
+/// V2.
+#[test]
+fn reading_gaussians_has_a_limit_of_time() {
+    let server = with(Limits { read_time: Duration::ZERO, ..Limits::default() });
+    let ply = encode(&Splats::from(Fake::cloud(1, 1)), Format::Ply, &WriteOptions::default()).unwrap().bytes;
+    let id = posted(&server, &[Part::file("small.ply", ply)]);
+    let job = server.until(&id, &["failed", "done"]);
+    assert!(job["error"].as_str().unwrap_or_default().contains("longer than 0 seconds"), "{job}");
+}
+
 /// V2.
 #[test]
 fn reading_has_a_limit_of_time() {

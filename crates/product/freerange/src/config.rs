@@ -253,6 +253,34 @@ impl Choices {
         }
         Ok(pipeline)
     }
+
+    /// Refuses a field of [`set`](Self::set) that a run of `pipeline` would not look at. `given`: it begins with Gaussians of
+    /// the user's.
+    ///
+    /// # Errors
+    /// Names the field, and what would have to be otherwise.
+    pub fn check_effect(&self, pipeline: &PipelineConfig, given: bool) -> Result<(), Error> {
+        let PipelineConfig { symmetry, propose, optimize, .. } = pipeline;
+        let made = !given;
+        let unused = [
+            ("propose.flow.", made && propose.init == Init::Flow, "propose.init: flow"),
+            ("propose.init", made, "no Gaussians to begin with"),
+            ("propose.count", made, "no Gaussians to begin with"),
+            ("symmetry.reflection_threshold", symmetry.detect == Detect::Auto, "symmetry.detect: auto"),
+            ("symmetry.revolution_threshold", symmetry.detect == Detect::Auto, "symmetry.detect: auto"),
+            ("optimize.max_resolution", optimize.iterations > 0, "optimize.iterations: 1 or more"),
+        ];
+        for (key, value) in &self.set {
+            for (field, used, with) in unused {
+                let named = key == field || field.ends_with('.') && key.starts_with(field);
+                if named && !used {
+                    let expected = format!("nothing, since it has no effect here, or {with}");
+                    return Err(Error::input(format!("--set {key}"), expected, value));
+                }
+            }
+        }
+        Ok(())
+    }
 }
 
 /// Paths of all fields that hold no others.

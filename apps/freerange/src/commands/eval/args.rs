@@ -156,6 +156,15 @@ impl RunArgs {
             MethodName::Model | MethodName::Start => {
                 let model = self.pipeline.open(device)?;
                 let mut options = self.pipeline.options(&model, self.samples)?;
+                if self.method == MethodName::Start {
+                    let of_network = self.pipeline.set.iter().find(|(key, _)| key.starts_with("refine."));
+                    let option = of_network.map(|(key, _)| format!("--set {key}"));
+                    if let Some(option) = option.or_else(|| self.pipeline.precision.map(|_| "--precision".into())) {
+                        return refuse(&format!(
+                            "{option} goes with --method model only: start leaves the network out"
+                        ));
+                    }
+                }
                 options = internal::without_network(options, self.method == MethodName::Start);
                 model.check(&options)?;
                 let sha256 = self.pipeline.checkpoint_sha256()?;

@@ -128,7 +128,7 @@ impl Method {
             Self::White => vec![(0, Gaussians::default())],
             Self::Ply(folder) => {
                 let file = read_ply(&ply_file(folder, &case.object, case.views)?)?;
-                notes = file.notes;
+                notes = file.notes.into_iter().map(|note| note.text).collect();
                 vec![(0, file.splats.cloud)]
             }
         };

@@ -13,7 +13,7 @@ use super::{
     encoder::{load_encoder, require_same_encoder, require_same_model},
     folder::claim,
     objects::{normalization, training_objects, validation_objects},
-    state::{State, latest_state},
+    state::{State, latest_state, recorded_compute},
     virtual_ranks::virtual_ranks,
 };
 use crate::{
@@ -79,9 +79,10 @@ impl Trainer {
         if let Some(validation) = &prepared.validation {
             validation.require_comparisons(ranks, &config)?;
         }
-        let compute = compute_of_first(ranks, config.optimizer.compute, &plain)?;
         // Not before the data are there: a folder that holds a configuration belongs to a run.
         let lock = agree(ranks, if share[0] == 0 { claim(&config, folder).map(Some) } else { Ok(None) })?;
+        let compute = compute_of_run(ranks, config.optimizer.compute, folder, &plain)?;
+        progress(&format!("computing in {compute}"));
         let described = serde_json::to_value(&config).expect("a configuration is plain");
         let (config, _) = config.apart();
         let (model, frozen) = agree(ranks, prepared.model(&config, compute, &plain))?;
@@ -107,6 +108,7 @@ impl Trainer {
         progress(&format!("filling the window with {} objects", config.data.window));
         let virtual_ranks = agree(ranks, virtual_ranks(&config.data, &positions, share, &source))?;
         state.set_positions(positions);
+        state.compute = Some(compute);
         Ok(Self {
             photometric: Photometric::new(&state.normalization, &plain),
             config,
@@ -196,20 +198,23 @@ impl Prepared {
     }
 }
 
-/// What is automatic is chosen by rank 0: which arithmetic is faster may look different from each of them.
-fn compute_of_first(ranks: &dyn Ranks, compute: Compute, device: &Device) -> Result<Compute, TrainError> {
-    if ranks.world() == 1 || compute != Compute::Auto {
+/// What a run computes in. What is automatic is chosen once, by rank 0, and recorded in the run's state: which arithmetic is
+/// faster may look different from each rank and at each start, and a run that goes on in another one gives other bits.
+fn compute_of_run(ranks: &dyn Ranks, compute: Compute, folder: &Path, device: &Device) -> Result<Compute, TrainError> {
+    if compute != Compute::Auto {
         return Ok(compute);
     }
-    let chosen = serde_json::to_vec(&compute.on(device)).expect("a name");
-    let chosen = serde_json::from_slice::<Compute>(&from_first(ranks, &chosen)?)
-        .map_err(|e| TrainError::Ranks { problem: e.to_string() })?;
-    let supported = chosen.supported(device);
+    let choose = || Ok(recorded_compute(folder)?.unwrap_or_else(|| compute.on(device)));
+    let chosen = agree(ranks, if ranks.rank() == 0 { choose().map(Some) } else { Ok(None) })?;
+    let chosen = serde_json::to_vec(&chosen).expect("a name");
+    let chosen = serde_json::from_slice::<Option<Compute>>(&from_first(ranks, &chosen)?)
+        .map_err(|e| TrainError::Ranks { problem: e.to_string() })?
+        .expect("rank 0 chose");
     let refused = || {
-        let found = format!("auto, which is {chosen:?} on rank 0 and not on rank {}", ranks.rank());
+        let found = format!("auto, which is {chosen} in this run, on a device of rank {} without it", ranks.rank());
         Invalid::new("optimizer.compute", "what the devices of all ranks can do", found)
     };
-    agree(ranks, if supported { Ok(()) } else { Err(refused().into()) })?;
+    agree(ranks, if chosen.supported(device) { Ok(()) } else { Err(refused().into()) })?;
     Ok(chosen)
 }
 

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use burn::{module::Module, store::ModuleRecord, tensor::Device};
 use freerange_gaussians::{Normalization, channel};
-use freerange_model::{Checkpoint, FreeRange, WeightsOrigin};
+use freerange_model::{Checkpoint, Compute, FreeRange, WeightsOrigin};
 use freerange_util::{IoError, sync_folder, sync_tree};
 
 use super::{Best, Initial, Trainer, encoder::require_same_encoder};
@@ -47,9 +47,19 @@ pub(super) struct Progress {
     /// The frozen encoder's weights; none of an encoder of its own, or of random ones.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(super) encoder: Option<WeightsOrigin>,
+    /// What the run computes in; none in states of before this was recorded.
+    #[serde(default)]
+    pub(super) compute: Option<Compute>,
 }
 
 impl Progress {
+    /// That of the state in `path`.
+    fn load(path: &Path) -> Result<Self, TrainError> {
+        let file = path.join("progress.json");
+        let text = std::fs::read_to_string(&file).map_err(IoError::at(&file))?;
+        serde_json::from_str(&text).map_err(|e| TrainError::State { path: file, problem: e.to_string() })
+    }
+
     /// Of each virtual rank, the number of the first object of its window.
     pub(super) fn positions(&self, data: &DataConfig) -> Result<Vec<u64>, String> {
         match (data.virtual_ranks, self.first_objects.len()) {
@@ -94,12 +104,9 @@ impl State {
         let model = model.try_load_record(record("model")?).map_err(|e| broken("model", e.to_string()))?;
         let average = Weights::of(&average);
         let optimizer = AdamW::load(&state("optimizer.safetensors"), &average, device)?;
-        let file = state("progress.json");
-        let text = std::fs::read_to_string(&file).map_err(IoError::at(&file))?;
-        let mut progress = serde_json::from_str::<Progress>(&text)
-            .map_err(|e| TrainError::State { path: file.clone(), problem: e.to_string() })?;
+        let mut progress = Progress::load(path)?;
         progress.measured.get_or_insert(progress.step);
-        let run = || format!("the run, in {}", file.display());
+        let run = || format!("the run, in {}", state("progress.json").display());
         require_same_encoder(progress.encoder.as_ref(), origin, run)?;
         Ok(Self { model, average, optimizer, progress })
     }
@@ -156,6 +163,7 @@ impl State {
             best: None,
             measured: Some(0),
             encoder,
+            compute: None,
         };
         let average = Weights::of(&model);
         let optimizer = AdamW::new(average.0.len());
@@ -241,4 +249,9 @@ fn states(folder: &Path) -> Result<Vec<PathBuf>, TrainError> {
 
 pub(super) fn latest_state(folder: &Path) -> Result<Option<PathBuf>, TrainError> {
     Ok(states(folder)?.pop())
+}
+
+/// What the run in `folder` computes in, where its latest state says so.
+pub(super) fn recorded_compute(folder: &Path) -> Result<Option<Compute>, TrainError> {
+    Ok(latest_state(folder)?.map(|path| Progress::load(&path)).transpose()?.and_then(|progress| progress.compute))
 }

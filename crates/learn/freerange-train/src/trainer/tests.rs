@@ -744,6 +744,35 @@ fn a_state_of_before_measurements_were_recorded_has_been_measured() {
 }
 
 #[test]
+fn what_is_automatic_is_chosen_once_for_a_run() {
+    use freerange_model::Compute;
+    let place = tempfile::tempdir().unwrap();
+    let file = place.path().join("state-000000000/progress.json");
+    let recorded = || -> serde_json::Value { serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap() };
+    let begin = |compute: Compute| {
+        let mut config = config();
+        config.optimizer.compute = compute;
+        let mut said = Vec::new();
+        let opened = Trainer::open(config, place.path(), None, &Device::flex(), |line| said.push(line.to_owned()));
+        opened.unwrap().save().unwrap();
+        said.into_iter().find_map(|line| line.strip_prefix("computing in ").map(str::to_owned)).unwrap()
+    };
+    let chosen = begin(Compute::Auto);
+    assert_eq!(recorded()["compute"], chosen);
+    // Timed on another machine, or a busy one.
+    let other = if chosen == "f32" { "bf16" } else { "f32" };
+    let mut progress = recorded();
+    progress["compute"] = other.into();
+    std::fs::write(&file, progress.to_string()).unwrap();
+    assert_eq!(begin(Compute::Auto), other);
+    assert_eq!(recorded()["compute"], other);
+    // What is asked for holds, and is what goes on.
+    let asked = if chosen == "f32" { Compute::F32 } else { Compute::Bf16 };
+    assert_eq!(begin(asked), chosen);
+    assert_eq!(begin(Compute::Auto), chosen);
+}
+
+#[test]
 fn a_step_in_parts_can_be_given_up() {
     let place = tempfile::tempdir().unwrap();
     let mut config = config();

@@ -123,7 +123,7 @@ impl Board {
     fn read(&self, unread: &Unread) -> Result<Read, Refusal> {
         let Unread { id, folder, options, splats, cancel } = unread;
         if let Some(file) = splats {
-            let stop = Stop::on(cancel.clone(), None);
+            let stop = Stop::on(cancel.clone(), Some(Instant::now() + self.limits.read_time));
             let found = splats::prepare(file, folder, options.up()?, &self.limits, &stop)?;
             save_thumbnail(folder, &splats::thumbnail(&*self.engine, &found))?;
             return Ok(Read { understood: found.understood, result: Some((found.gaussians, found.up)) });

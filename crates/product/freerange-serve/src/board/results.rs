@@ -43,7 +43,7 @@ pub(super) fn forget_edits(folder: &Path, samples: usize) {
 /// Bytes of memory that a byte of a result takes while it is read, converted and sent: formats of text take the most.
 const MEMORY_PER_BYTE: u64 = 8;
 
-/// Memory for a result, from before it is read until it is sent.
+/// Memory for a result, from before it is read until it is sent, or for a body that arrives.
 pub struct Held {
     board: Arc<Board>,
     bytes: u64,
@@ -55,6 +55,11 @@ impl Held {
         let (folder, ..) = board.with_sample(id, i)?;
         let size = |file: PathBuf| fs::metadata(file).map_or(0, |data| data.len());
         let bytes = MEMORY_PER_BYTE * size(sample_file(&folder, i)).max(size(whole_file(&folder, i)));
+        Self::bytes(board, bytes)
+    }
+
+    /// For so many bytes, such as those of a body, before the first of them is read. Refused as [`take`](Self::take) is.
+    pub fn bytes(board: &Arc<Board>, bytes: u64) -> Result<Self, Refusal> {
         let before = board.held.fetch_add(bytes, Relaxed);
         let held = Self { board: board.clone(), bytes };
         match before == 0 || before + bytes <= board.limits.memory {

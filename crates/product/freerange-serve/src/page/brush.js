@@ -91,6 +91,7 @@ const showMask = () => {
   zoom.draw(context, brush.shown);
   context.strokeStyle = adding ? "#00d060" : "#ff5030";
   context.lineWidth = Math.max(1, brush.width / 300);
+  context.setLineDash(adding ? [] : [4, 4].map((v) => v * context.lineWidth));
   context.beginPath();
   context.arc(...zoom.outside(at), size() * zoom.scale, 0, 2 * Math.PI);
   context.stroke();

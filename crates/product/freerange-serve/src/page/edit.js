@@ -10,7 +10,8 @@ const GRID = 20;
 const SHARE = 0.02;
 
 /**
- * @typedef {{id: string, sample: number, rows: Float32Array, kept: Uint8Array, low: number[], high: number[], before: Uint8Array[]}} Edit
+ * @typedef {{id: string, sample: number, rows: Float32Array, kept: Uint8Array, spans: number[][], before: Uint8Array[]}} Edit
+ * `spans`: along each axis the least position, those with 5 % of all below and above, and the largest.
  * @type {?Edit}
  */
 let edit = null;
@@ -25,9 +26,10 @@ const bytes = async (path) => {
 
 const ends = () => [0, 1, 2].map((axis) => [Number(input(`from-${axis}`).value) / 100, Number(input(`to-${axis}`).value) / 100]);
 
-/** The box: where it begins and ends along each axis. Each slider says its place. @param {Edit} of */
-const limitsOf = ({ low, high }) => ends().map((both, axis) => both.map((share, i) => {
-  const place = low[axis] + share * (high[axis] - low[axis]), text = place.toPrecision(3), name = `${["from", "to"][i]}-${axis}`;
+/** The box: where it begins and ends along each axis. Each slider says its place. Its ends are those of all; else floaters far away do not count. @param {Edit} of */
+const limitsOf = ({ spans }) => ends().map((both, axis) => both.map((share, i) => {
+  const [least, low, high, most] = spans[axis], middle = low + (1.6 * share - 0.3) * (high - low);
+  const place = share === 0 ? least : share === 1 ? most : Math.min(most, Math.max(least, middle)), text = place.toPrecision(3), name = `${["from", "to"][i]}-${axis}`;
   box(`${name}-at`).textContent = text;
   input(name).setAttribute("aria-valuetext", text);
   return place;
@@ -71,14 +73,12 @@ const begin = async (sample) => {
   const path = `/jobs/${job.id}/samples/${sample}`;
   const [rows, kept] = await Promise.all([bytes(`${path}/whole`), bytes(`${path}/kept`)]);
   if (app.job?.id !== job.id) return;
-  const data = new Float32Array(rows), low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
-  for (let i = 0; i < data.length; i += CHANNELS) {
-    for (let axis = 0; axis < 3; axis++) {
-      low[axis] = Math.min(low[axis], data[i + axis]);
-      high[axis] = Math.max(high[axis], data[i + axis]);
-    }
-  }
-  edit = { id: job.id, sample, rows: data, kept: new Uint8Array(kept), low, high, before: [] };
+  const data = new Float32Array(rows), last = data.length / CHANNELS - 1;
+  const spans = [0, 1, 2].map((axis) => {
+    const sorted = Float32Array.from({ length: last + 1 }, (_, i) => data[i * CHANNELS + axis]).sort();
+    return [0, 0.05, 0.95, 1].map((share) => sorted[Math.floor(share * last)]);
+  });
+  edit = { id: job.id, sample, rows: data, kept: new Uint8Array(kept), spans, before: [] };
   whole();
   show(edit.kept);
 };
@@ -101,18 +101,14 @@ const save = async (kept, undoes = false) => {
 };
 
 /** Gaussians of parts that hang together with few others, or none, are left out. @param {Edit} of */
-const tidy = ({ rows, kept, low }) => {
+const tidy = ({ rows, kept, spans }) => {
   // What floats far away makes the object no larger.
-  const extent = [0, 1, 2].map((axis) => {
-    const sorted = Float32Array.from({ length: rows.length / CHANNELS }, (_, i) => rows[i * CHANNELS + axis]).sort();
-    return sorted[Math.floor(0.95 * sorted.length)] - sorted[Math.floor(0.05 * sorted.length)];
-  });
-  const step = Math.max(...extent) / GRID || 1, side = 100_000;
+  const step = Math.max(...spans.map(([, low, high]) => high - low)) / GRID || 1, side = 100_000;
   /** @type {Map<number, number[]>} */
   const cells = new Map();
   kept.forEach((v, i) => {
     if (!v) return;
-    const at = [0, 1, 2].reduce((sum, axis) => sum * side + 1 + Math.floor((rows[i * CHANNELS + axis] - low[axis]) / step), 0), cell = cells.get(at);
+    const at = [0, 1, 2].reduce((sum, axis) => sum * side + 1 + Math.floor((rows[i * CHANNELS + axis] - spans[axis][0]) / step), 0), cell = cells.get(at);
     if (cell) cell.push(i);
     else cells.set(at, [i]);
   });

@@ -87,6 +87,8 @@ export const open = async () => {
   listen(id);
 };
 window.addEventListener("hashchange", () => void attempt(open));
+// A browser has six connections for a server: tabs that nobody sees leave them to others.
+document.addEventListener("visibilitychange", () => document.hidden ? leave() : void attempt(open));
 
 const listJobs = async () => {
   /** @type {Status[]} */

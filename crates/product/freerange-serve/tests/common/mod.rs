@@ -244,6 +244,12 @@ impl Running {
         self.raw(&[head.as_bytes(), body].concat())
     }
 
+    /// The answer to a `PUT` of which only the head and the first byte were sent.
+    pub fn begun(&self, path: &str, length: usize) -> Reply {
+        let head = format!("PUT {path} HTTP/1.1\r\nHost: {}\r\nContent-Length: {length}\r\n\r\n1", self.address);
+        self.raw(head.as_bytes())
+    }
+
     pub fn get(&self, path: &str) -> Reply {
         self.send("GET", path, "", b"")
     }
