@@ -5,7 +5,9 @@
 
 mod arguments;
 mod error;
+mod interrupt;
 mod model;
+mod process;
 mod raster;
 mod scene;
 
@@ -28,8 +30,9 @@ mod _core {
 
     /// Every device, the best first: name, hardware, and why it cannot be used if it cannot.
     #[pyfunction]
-    fn devices(py: Python<'_>) -> Vec<(String, String, Option<String>)> {
+    fn devices(py: Python<'_>) -> PyResult<Vec<(String, String, Option<String>)>> {
+        process::check_process_for("auto")?;
         let found = py.detach(freerange::Device::list);
-        found.into_iter().map(|d| (d.name, d.properties.hardware, d.problem)).collect()
+        Ok(found.into_iter().map(|d| (d.name, d.properties.hardware, d.problem)).collect())
     }
 }

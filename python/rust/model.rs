@@ -7,17 +7,14 @@ use std::{
     time::{Duration, Instant},
 };
 
-use freerange::{
-    DeviceName, EncoderPlaces, FrameConfig, Hints, Options, Reconstructor, View, cut_out, internal::shipped,
-    machine::cache_folder,
-};
+use freerange::{DeviceName, EncoderPlaces, Options, Reconstructor, View, internal::shipped, machine::cache_folder};
 use freerange_model::hub::Hub;
-use glam::DVec3;
 use pyo3::{prelude::*, types::PyByteArray};
 
 use crate::{
-    arguments::{RawOptions, RawUp, RawView, refuse, told, views},
+    arguments::{RawOptions, refuse, told},
     error::{of_hub, of_model},
+    process::{check_process, check_process_for},
     raster::bytes,
     scene::{Scene, told_notes},
 };
@@ -43,6 +40,7 @@ pub fn load(
     encoder_weights: Option<PathBuf>,
 ) -> PyResult<Model> {
     let name: DeviceName = device.parse().map_err(|e: String| told("device", &e, device))?;
+    check_process_for(device)?;
     py.detach(|| {
         let opened = name.open().map_err(of_model)?;
         let model = match &checkpoint {
@@ -90,30 +88,12 @@ impl Model {
         self.model.provenance().to_string()
     }
 
-    /// Samples for views in memory.
-    fn reconstruct(
-        &self,
-        py: Python<'_>,
-        raw: Vec<RawView>,
-        chosen: RawOptions,
-        up: RawUp,
-        center: Option<[f64; 3]>,
-        radius: Option<f64>,
-        on_step: Option<Py<PyAny>>,
-    ) -> PyResult<Made> {
-        let mut views = views(raw)?;
-        let mut options = chosen.options(&self.model)?;
-        let center = center.map(DVec3::from);
-        let up = up.read(false)?.unwrap_or_default();
-        options.frame = FrameConfig { up, center, radius, ..FrameConfig::default() };
-        let notes = py.detach(|| {
-            self.model.check(&options).map_err(of_model)?;
-            cut_out(&mut views, &Hints { center, radius, ..Hints::default() }).map(told_notes).map_err(of_model)
-        })?;
-        self.run(py, &views, &options, notes, on_step)
+    /// Refuses options that it cannot follow.
+    fn check(&self, chosen: RawOptions) -> PyResult<()> {
+        self.model.check(&chosen.options(&self.model)?).map_err(of_model)
     }
 
-    /// Samples for a scene that was read.
+    /// Samples for a scene.
     fn reconstruct_scene(
         &self,
         py: Python<'_>,
@@ -121,9 +101,10 @@ impl Model {
         chosen: RawOptions,
         on_step: Option<Py<PyAny>>,
     ) -> PyResult<Made> {
+        check_process()?;
         let mut options = chosen.options(&self.model)?;
         options.frame = scene.frame;
-        self.run(py, &scene.views, &options, scene.notes(), on_step)
+        self.run(py, &scene.loaded.views, &options, scene.notes(), on_step)
     }
 }
 

@@ -7,6 +7,7 @@ use pyo3::{prelude::*, pybacked::PyBackedBytes, types::PyByteArray};
 use crate::{
     arguments::{RawCamera, camera, cameras, floats},
     error::of_raster,
+    process::check_process,
 };
 
 /// The bytes of numbers, for NumPy to wrap.
@@ -37,6 +38,7 @@ pub fn rasterize(
     backgrounds: Vec<[f32; 3]>,
     depth: bool,
 ) -> PyResult<Rendered> {
+    check_process()?;
     let rows = floats("gaussians", &rows)?;
     let cameras: Vec<Camera> = cameras(raw)?;
     let config = RasterConfig { depth, ..RasterConfig::default() };
@@ -69,6 +71,7 @@ impl Rendered {
         d_alpha: PyBackedBytes,
         d_depth: PyBackedBytes,
     ) -> PyResult<(Py<PyByteArray>, Py<PyByteArray>)> {
+        check_process()?;
         let (d_rgb, d_alpha) = (floats("d_rgb", &d_rgb)?, floats("d_alpha", &d_alpha)?);
         let d_depth = floats("d_depth", &d_depth)?;
         let gradients = py.detach(|| render_backward(&self.rows, &self.output, &d_rgb, &d_alpha, &d_depth));

@@ -3,8 +3,8 @@
 use std::path::PathBuf;
 
 use freerange::{
-    CameraFormat, FrameConfig, Gaussians, Harmonics, Hints, LoadConfig, MaskSource, Note, NoteKind, ReadConfig,
-    SceneConfig, Splats, Turntable, View, cut_out,
+    CameraFormat, Error, FrameConfig, Gaussians, Harmonics, Hints, LoadConfig, Loaded, MaskSource, Note, NoteKind,
+    ReadConfig, SceneConfig, Splats, Turntable, View, load_views, warnings_of,
 };
 use glam::{DQuat, DVec3};
 use pyo3::{prelude::*, pybacked::PyBackedBytes, types::PyByteArray};
@@ -12,16 +12,25 @@ use pyo3::{prelude::*, pybacked::PyBackedBytes, types::PyByteArray};
 use crate::{
     arguments::{RawCamera, RawUp, RawView, floats, raw_camera, refuse, told, views},
     error::of_model,
+    interrupt::interruptible,
+    process::check_process,
     raster::bytes,
 };
 
 /// Photos with cameras, cut out.
 #[pyclass(frozen)]
 pub struct Scene {
-    pub views: Vec<View>,
-    further: Vec<View>,
+    pub loaded: Loaded,
     pub frame: FrameConfig,
     notes: Vec<Note>,
+}
+
+impl Scene {
+    /// With what may go wrong among the notes. What cannot be reconstructed at all is refused once somebody wants that.
+    fn new(loaded: Loaded, frame: FrameConfig, mut notes: Vec<Note>) -> Self {
+        notes.extend(warnings_of(&loaded, &frame, usize::MAX).unwrap_or_default());
+        Self { loaded, frame, notes }
+    }
 }
 
 /// How photos are read; as on the command line.
@@ -66,12 +75,13 @@ pub fn read_scene(py: Python<'_>, path: PathBuf, photos: Photos, up: RawUp) -> P
         ..LoadConfig::default()
     };
     let up = up.read(true)?;
-    py.detach(|| {
-        let config = SceneConfig { cameras: read, photos: config, up };
-        let read = freerange::Scene::open_with(&path, &config).map_err(of_model)?;
-        let (frame, notes) = (read.frame, read.notes);
-        Ok(Scene { views: read.loaded.views, further: read.loaded.further, frame, notes })
-    })
+    check_process()?;
+    let made = interruptible(py, move |stop| {
+        let config = SceneConfig { cameras: read, photos: LoadConfig { stop: stop.clone(), ..config }, up };
+        let read = freerange::Scene::open_with(&path, &config)?;
+        Ok::<_, Error>(Scene::new(read.loaded, read.frame, read.notes))
+    });
+    made?.map_err(of_model)
 }
 
 /// Makes a scene of views in memory; those without a mask get one.
@@ -83,12 +93,17 @@ pub fn scene_of_views(
     center: Option<[f64; 3]>,
     radius: Option<f64>,
 ) -> PyResult<Scene> {
-    let (mut views, up) = (views(raw)?, up.read(false)?.unwrap_or_default());
+    let (views, up) = (views(raw)?, up.read(false)?.unwrap_or_default());
     let center = center.map(DVec3::from);
     let frame = FrameConfig { up, center, radius, ..FrameConfig::default() };
     let hints = Hints { center, radius, ..Hints::default() };
-    let notes = py.detach(|| cut_out(&mut views, &hints)).map_err(of_model)?;
-    Ok(Scene { views, further: Vec::new(), frame, notes })
+    check_process()?;
+    let made = interruptible(py, move |stop| {
+        let loaded = load_views(views, &hints, stop)?;
+        let notes = loaded.notes.clone();
+        Ok::<_, Error>(Scene::new(loaded, frame, notes))
+    });
+    made?.map_err(of_model)
 }
 
 /// A view: its name, its camera, RGBA of 8 bits.
@@ -103,12 +118,12 @@ fn all(py: Python<'_>, views: &[View]) -> Vec<Whole> {
 impl Scene {
     /// What it is reconstructed from.
     fn views(&self, py: Python<'_>) -> Vec<Whole> {
-        all(py, &self.views)
+        all(py, &self.loaded.views)
     }
 
     /// What it is only compared with.
     fn further(&self, py: Python<'_>) -> Vec<Whole> {
-        all(py, &self.further)
+        all(py, &self.loaded.further)
     }
 
     /// What was understood, for the user to read.
@@ -153,11 +168,16 @@ pub fn write_gaussians(
     py.detach(|| freerange::write_splats(&splats, &path, up.into())).map(told_notes).map_err(of_model)
 }
 
-/// Reads Gaussians from a file; those that fix their frame are turned into the one in which `up` is up.
+/// Gaussians of a file, the direction of up, and notes.
+type ReadSplats = (RawSplats, [f64; 3], Vec<(bool, String)>);
+
+/// Reads Gaussians from a file; those that fix their frame are turned into the one in which `up` is up. None: the
+/// file's word.
 #[pyfunction]
-pub fn read_gaussians(py: Python<'_>, path: PathBuf, up: [f64; 3]) -> PyResult<(RawSplats, Vec<(bool, String)>)> {
-    let (splats, notes) = py.detach(|| freerange::read_splats(&path, up.into())).map_err(of_model)?;
-    Ok((raw(py, splats), told_notes(notes)))
+pub fn read_gaussians(py: Python<'_>, path: PathBuf, up: Option<[f64; 3]>) -> PyResult<ReadSplats> {
+    let read = py.detach(|| freerange::read_splats(&path, up.map(DVec3::from)));
+    let (splats, up, notes) = read.map_err(of_model)?;
+    Ok((raw(py, splats), up.to_array(), told_notes(notes)))
 }
 
 /// Gaussians moved by `x -> scale * rotation * x + translation`; `rotation` is w x y z.

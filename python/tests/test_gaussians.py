@@ -27,6 +27,32 @@ def test_arrays_are_what_they_were(scattered, gaussians):
     assert np.array_equal(again.rows, gaussians.rows) and again.up == gaussians.up
 
 
+def test_shapes_that_numpy_users_have(scattered):
+    given, c2w, k, width, height = scattered
+    expected = freerange.render(**given, c2w=c2w, K=k, width=width, height=height).rgb
+    columns = dict(given, opacities=given["opacities"][:, None])
+    for found in (
+        freerange.render(**columns, c2w=c2w, K=k, width=width, height=height).rgb,
+        freerange.render(**given, c2w=c2w, K=k[None], width=width, height=height).rgb,
+        freerange.render(**given, c2w=c2w[None].repeat(3, axis=0), K=k[None], width=width, height=height).rgb[2],
+        freerange.render(**given, c2w=c2w[None].repeat(2, axis=0), K=k, width=width, height=height).rgb[1],
+    ):
+        assert np.array_equal(found, expected)
+
+
+def test_which_way_is_up_is_kept(gaussians, tmp_path):
+    """In a comment of a .ply, in a page; other files have none, or an up of their own."""
+    for name, up in [("ply", (0, -1, 0)), ("html", (0, -1, 0)), ("splat", (0, 0, 1)), ("glb", (0, 0, 1))]:
+        gaussians.save(tmp_path / f"g.{name}")
+        read = freerange.Gaussians.read(tmp_path / f"g.{name}")
+        assert read.up == up, name
+        assert freerange.Gaussians.read(tmp_path / f"g.{name}", up=(1, 0, 0)).up == (1, 0, 0)
+    kept = freerange.Gaussians.read(tmp_path / "g.ply")
+    assert np.array_equal(kept.means, gaussians.means)
+    kept.save(tmp_path / "again.ply")
+    assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "g.ply").read_bytes()
+
+
 def test_dlpack_takes_them_without_a_copy(gaussians):
     for field in ("means", "scales", "quats", "opacities", "colors", "rows"):
         array = getattr(gaussians, field)
@@ -85,11 +111,15 @@ def test_gsplats_order_and_names(scattered):
     black = freerange.render(*in_order, viewmats=viewmats, Ks=k, width=width, height=height, backgrounds=np.zeros((1, 3)))
     assert np.array_equal(black.rgb, freerange.render(**given, c2w=c2w, K=k, width=width, height=height, background=0.0).rgb)
     with pytest.raises(TypeError, match="either background or backgrounds, found both"):
-        freerange.render(*in_order, c2w=c2w, K=k, background=0.5, backgrounds=0.5)
+        freerange.render(**given, c2w=c2w, K=k, background=0.5, backgrounds=0.5)
     with pytest.raises(TypeError, match="either c2w or viewmats, found both"):
-        freerange.render(*in_order, c2w=c2w, viewmats=viewmats, K=k)
+        freerange.render(**given, c2w=c2w, viewmats=viewmats, K=k)
     with pytest.raises(TypeError, match="either K or Ks, found none"):
-        freerange.render(*in_order, c2w=c2w)
+        freerange.render(**given, c2w=c2w)
+    # Its cameras by position would be taken for camera to world.
+    for arrays in (in_order, map(np.ndarray.tolist, in_order)):
+        with pytest.raises(TypeError, match="c2w: .*viewmats=.*gsplat"):
+            freerange.render(*arrays, viewmats, k, width, height)
     with pytest.raises(ValueError, match="viewmats: .*off by"):
         freerange.render(*in_order, viewmats=2.0 * viewmats[:3], Ks=k)
 
@@ -130,8 +160,12 @@ def test_some_all_and_several(gaussians):
     assert len(gaussians.crop(low, high)) == n
     middle = np.sort(gaussians.means[:, 2])[n // 2] + 1e-4
     assert len(gaussians.crop(low, [high[0], high[1], middle])) == n // 2 + 1
+    assert len(gaussians.crop(low, [np.inf, np.inf, middle])) == n // 2 + 1
+    assert len(gaussians.crop([-np.inf] * 3, [np.inf] * 3)) == n
     with pytest.raises(ValueError, match="high"):
         gaussians.crop(high, low)
+    with pytest.raises(ValueError, match="low: .*nan"):
+        gaussians.crop([np.nan, 0, 0], high)
 
 
 def harmonic(scattered, degree=3):
@@ -209,6 +243,23 @@ def test_what_a_format_cannot_hold_is_a_warning(scattered, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         harmonic(scattered).save(tmp_path / "g.ply")
+        assert freerange.Gaussians.read(tmp_path / "g.ply").notes == []
+
+
+def test_what_is_left_out_of_a_file_is_a_warning(gaussians, tmp_path):
+    file = tmp_path / "g.ply"
+    gaussians.save(file)
+    header, end, rows = file.read_bytes().partition(b"end_header\n")
+    not_finite = np.float32(np.nan).tobytes() + rows[4:]
+    for content, words, left in [
+        (header + b"element camera 0\nproperty float x\n" + end + rows, "elements left out: camera", 5),
+        (header + end + not_finite, "1 Gaussians with numbers that are not finite are left out", 4),
+    ]:
+        file.write_bytes(content)
+        with pytest.warns(freerange.DroppedWarning, match=words) as caught:
+            again = freerange.Gaussians.read(file)
+        assert [w.filename for w in caught] == [__file__] and len(again) == left
+        assert again.notes == [str(caught[0].message)]
 
 
 def bad(scattered, **change):
@@ -224,7 +275,7 @@ def bad(scattered, **change):
         (dict(scales=np.zeros((5, 3))), ValueError, ["scales", "above 0"]),
         (dict(quats=np.zeros((5, 4))), ValueError, ["quats[0]", "rotation"]),
         (dict(opacities=np.full(5, 1.5)), ValueError, ["opacities", "0 to 1", "1.5"]),
-        (dict(opacities=np.full((5, 1), 0.5)), ValueError, ["opacities", "[5]", "[5, 1]"]),
+        (dict(opacities=np.full((5, 2), 0.5)), ValueError, ["opacities", "[5]", "[5, 2]"]),
         (dict(colors=np.full((5, 3), np.inf)), ValueError, ["colors[0, 0]", "finite", "inf"]),
         (dict(colors=[["red"] * 3] * 5), TypeError, ["colors", "numbers"]),
         (dict(c2w=np.eye(3)), ValueError, ["c2w", "[1, 4, 4]", "[1, 3, 3]"]),
@@ -252,7 +303,10 @@ def test_bad_files_are_named(gaussians, tmp_path):
     (tmp_path / "bad.ply").write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
     with pytest.raises(ValueError, match="bad.ply"):
         freerange.Gaussians.read(tmp_path / "bad.ply")
-    with pytest.raises(OSError):
+    with pytest.raises(FileNotFoundError, match="expected a folder") as caught:
         gaussians.save(tmp_path / "none" / "g.ply")
+    assert caught.value.filename == str(tmp_path / "none") and ".freerange-" not in str(caught.value)
+    with pytest.raises(NotADirectoryError, match="bad.ply"):
+        gaussians.save(tmp_path / "bad.ply" / "g.ply")
     with pytest.raises(ValueError, match="up"):
         freerange.Gaussians.read(tmp_path / "bad.ply", up=(0, 0, 0))

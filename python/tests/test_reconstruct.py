@@ -1,9 +1,16 @@
 """Images to Gaussians."""
 
+import ast
+import importlib.util
 import json
+import re
+import shutil
 import subprocess
 import threading
 import time
+import typing
+import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -97,6 +104,28 @@ def test_masks_alpha_and_floats_tell_the_same(model, bowl):
     assert len(cut) == len(with_alpha)
 
 
+def test_masks_of_zeros_and_ones(bowl):
+    """As many tools write them. The largest value of all masks decides, not each photo's own."""
+    images, intrinsics, c2w = bowl
+    solid = images[..., 3] >= 128
+    rgb = np.where(solid[..., None], images[..., :3], np.uint8(0))
+    ones = solid.astype(np.uint8)
+
+    def cut_out(images, masks=None):
+        return freerange.Scene.from_arrays(images, intrinsics, c2w, masks, convention="opengl").images
+
+    expected = cut_out(rgb, ones * np.uint8(255))
+    assert {0, 255} == set(np.unique(expected[0][..., 3]))
+    for masks in (ones, list(ones), solid, solid.astype(np.float32), [solid[0], ones[1], solid[2].astype(np.float64), ones[3]]):
+        assert np.array_equal(cut_out(rgb, masks), expected)
+    assert np.array_equal(cut_out(np.concatenate([rgb, ones[..., None]], axis=-1)), expected)
+    # Both at once: each has a maximum of its own.
+    assert np.array_equal(cut_out(np.concatenate([rgb, ones[..., None]], axis=-1), ones * np.uint8(255)), expected)
+    for masks in (np.concatenate([ones[:1], ones[1:] * np.uint8(255)]), np.zeros_like(ones), ones * np.float32(1 / 255)):
+        with pytest.raises(ValueError, match=r"images\[0\].*empty"):
+            cut_out(rgb, masks)
+
+
 def test_seeds_are_samples(model, bowl):
     images, intrinsics, c2w = bowl
     quick = dict(convention="opengl", iterations=0, init="flow", symmetry="off", set={"propose.flow.steps": 2, "refine.passes": 1})
@@ -155,7 +184,6 @@ assert len(scene) == len(poses), scene
 assert np.allclose(scene.c2w[:, :3, 3], poses[:, :3, 3], atol=1e-5), scene.c2w
 assert any("SIMPLE_RADIAL" in note or "distort" in note for note in scene.notes), scene.notes
 """
-    import shutil
     import sys
 
     np.save(tmp_path / "c2w.npy", bowl[2] @ np.diag([1.0, -1.0, -1.0, 1.0]))
@@ -166,11 +194,108 @@ assert any("SIMPLE_RADIAL" in note or "distort" in note for note in scene.notes)
     assert run.returncode == 0, run.stderr
 
 
+class Colmap:
+    """What `Scene.from_pycolmap` uses of a reconstruction: it writes itself as text."""
+
+    def __init__(self, bowl, names):
+        images, self.intrinsics, self.c2w = bowl
+        self.height, self.width = images.shape[1:3]
+        self.names = names
+
+    def write(self, folder):
+        (fx, _, cx), (_, fy, cy), _ = self.intrinsics[0]
+        lines = []
+        for i, name in enumerate(self.names):
+            pose = np.linalg.inv(self.c2w[i] @ np.diag([1.0, -1.0, -1.0, 1.0]))
+            rotation = freerange._check.similarity("pose", pose)[2]
+            lines.append(" ".join(map(str, [i + 1, *rotation, *pose[:3, 3], 1, name])) + "\n\n")
+        (Path(folder) / "cameras.txt").write_text(f"1 PINHOLE {self.width} {self.height} {fx} {fy} {cx} {cy}\n")
+        (Path(folder) / "images.txt").write_text("".join(lines))
+        (Path(folder) / "points3D.txt").write_text("")
+
+
+@pytest.fixture
+def copy(tmp_path):
+    """A copy of the example's photos, with their cameras."""
+    shutil.copytree(BOWL / "train", tmp_path / "train")
+    shutil.copy(BOWL / "transforms_train.json", tmp_path / "transforms.json")
+    return tmp_path
+
+
+def test_what_a_scene_leaves_out_is_a_warning(copy, bowl, model):
+    """Once, and at the line that called the package. Of three photos it is also said that they are few."""
+
+    def of_loss(caught):
+        return [w for w in caught if not re.search("only 3 photos|no photo from", str(w.message))]
+
+    with pytest.warns(freerange.DroppedWarning, match="1 photos have no camera and are left out: 003.png") as caught:
+        scene = freerange.Scene.from_pycolmap(Colmap(bowl, ["000.png", "001.png", "002.png"]), copy / "train")
+    assert len(scene) == 3 and {w.filename for w in caught} == {__file__} and len(of_loss(caught)) == 1
+    (copy / "masks").mkdir()
+    shutil.copy(copy / "train" / "000.png", copy / "masks" / "other.png")
+    with pytest.warns(freerange.DroppedWarning, match="none of its 1 images has a photo's name") as caught:
+        freerange.Scene.read(copy)
+    assert [w.filename for w in caught] == [__file__]
+    shutil.rmtree(copy / "masks")
+    (copy / "train" / "003.png").unlink()
+    with pytest.warns(freerange.DroppedWarning, match="1 of 4 photos with cameras are not there and left out") as caught:
+        scene = freerange.Scene.read(copy)
+    assert {w.filename for w in caught} == {__file__} and len(scene) == 3 and len(of_loss(caught)) == 1
+    assert str(of_loss(caught)[0].message) in scene.notes
+    quick = dict(iterations=0, symmetry="off", set={"propose.count": 1, "refine.passes": 1})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # The scene has said so.
+        known = model.reconstruct_scene(scene, **quick)
+    assert str(of_loss(caught)[0].message) in known.notes
+    with pytest.warns(freerange.DroppedWarning, match="1 of 4 photos") as caught:
+        read = model.reconstruct_scene(copy, **quick)
+    assert {w.filename for w in caught} == {__file__} and len(of_loss(caught)) == 1 and read.notes == known.notes
+
+
+def test_what_a_scene_assumes_is_a_note(copy):
+    told = json.loads((copy / "transforms.json").read_text())
+    told["frames"][0]["file_path"] = "train/000.jpg"
+    (copy / "transforms.json").write_text(json.dumps(told))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not any("other names" in note for note in freerange.Scene.read(BOWL).notes)
+        assert any("000.png for 000.jpg" in note for note in freerange.Scene.read(copy).notes)
+
+
+def functions_of(module):
+    """Public functions, methods and classes in a module's source, since its imports may be missing: name, docstring, arguments with
+    their types, fields."""
+    tree = ast.parse(Path(importlib.util.find_spec(module).origin).read_text())
+    public = [node for node in tree.body if not getattr(node, "name", "_").startswith("_")]
+    for kind in [node for node in public if isinstance(node, ast.ClassDef)]:
+        fields = [f.target.id for f in kind.body if isinstance(f, ast.AnnAssign)]
+        yield kind.name, ast.get_docstring(kind), {}, fields
+        methods = [node for node in kind.body if isinstance(node, ast.FunctionDef)]
+        public += [node for node in methods if node.name == "__init__" or not node.name.startswith("_")]
+    for function in [node for node in public if isinstance(node, ast.FunctionDef)]:
+        arguments = function.args
+        assert not arguments.vararg and not arguments.kwarg, function.name
+        listed = [a for a in arguments.posonlyargs + arguments.args + arguments.kwonlyargs if a.annotation]
+        yield function.name, ast.get_docstring(function), {a.arg: ast.unparse(a.annotation) for a in listed}, []
+
+
+@pytest.mark.parametrize("module", ["freerange.torch", "freerange.ffgs"])
+def test_help_of_what_needs_other_packages_is_readable(module):
+    found = list(functions_of(module))
+    assert {"freerange.torch": "rasterize", "freerange.ffgs": "pipeline"}[module] in [name for name, *_ in found]
+    for name, text, arguments, fields in found:
+        assert text, name
+        assert all(a in text.partition("Args:")[2] for a in arguments), f"{name}: {arguments}"
+        assert "Any" not in arguments.values(), f"{name}: {arguments}"
+        assert all(f"{f}: " in text.partition("Attributes:")[2] for f in fields), f"{name}: {fields}"
+
+
 def test_help_is_readable():
     """Every public function and method has its arguments in its signature and under `Args:`; classes have theirs under `Attributes:`."""
     import inspect
 
-    found = [freerange.load, freerange.render]
+    found = [freerange.load, freerange.render, freerange.devices]
     for kind in (freerange.Gaussians, freerange.Model, freerange.Scene):
         public = [member for name, member in inspect.getmembers(kind, callable) if not name.startswith("_")]
         found += [getattr(member, "__func__", member) for member in public]
@@ -183,6 +308,10 @@ def test_help_is_readable():
         assert not kinds & {inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL}, function
         told = text.partition("Args:")[2]
         assert text and all(name in told for name in names), f"{function.__qualname__}: {names}"
+        # Types of other packages may be anything; those of arrays are told, and can be looked up.
+        types = {name: kind for name, kind in getattr(function, "__annotations__", {}).items() if kind == "Any"}
+        assert not set(types) - {"return", "reconstruction", "device"}, f"{function.__qualname__}: {types}"
+        assert function is freerange.devices or typing.get_type_hints(function)
     for kind in (freerange.Gaussians, freerange.Render, freerange.Scene, freerange.Step):
         told = inspect.getdoc(kind).partition("Attributes:")[2]
         assert all(f"{name}: " in told for name in kind.__annotations__ if not name.startswith("_")), kind

@@ -15,7 +15,17 @@ def test_without_torch_it_says_so():
     assert run.returncode != 0 and "ImportError: freerange.torch: expected PyTorch, found none" in run.stderr
 
 
+    code = (
+        "import sys; sys.modules['torch'] = None; import freerange\n"
+        "freerange.Gaussians([[0, 0, 0]], [[1, 1, 1]], [[1, 0, 0, 0]], [0.5], [[0, 0, 0]]).to_torch()"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert run.returncode != 0 and "ImportError: to_torch: expected PyTorch, found none: pip install" in run.stderr
+
+
 torch = pytest.importorskip("torch")
+import freerange.torch  # noqa: E402
+
 FIELDS = ("means", "scales", "quats", "opacities", "colors")
 
 
@@ -74,6 +84,21 @@ def test_gradients_are_those_of_the_reference(scattered):
     assert error < 2e-5, error
 
 
+def test_gsplats_order_takes_its_cameras_by_name(scattered):
+    gaussians, (c2w, k, width, height) = tensors(scattered, torch.float32)
+    expected = freerange.render(*gaussians.values(), c2w, k, width, height).rgb
+    gaussians["opacities"] = gaussians["opacities"][:, None]
+    in_order = [gaussians[f] for f in ("means", "quats", "scales", "opacities", "colors")]
+    viewmats = torch.tensor(np.linalg.inv(c2w))
+    cameras = dict(viewmats=viewmats[None], Ks=torch.tensor(k)[None], width=width, height=height)
+    found = freerange.render(*in_order, **cameras).rgb[0]
+    assert torch.allclose(found, expected, atol=1e-6)
+    found.sum().backward()
+    for render in (freerange.render, freerange.torch.render):
+        with pytest.raises(TypeError, match="c2w: .*viewmats=.*gsplat"):
+            render(*in_order, viewmats[None], torch.tensor(k)[None], width, height)
+
+
 def test_tensors_and_arrays_give_the_same(scattered):
     gaussians, (c2w, k, width, height) = tensors(scattered, torch.float32)
     rgb, alpha, z = freerange.render(*gaussians.values(), torch.tensor(c2w), torch.tensor(k), width, height, 0.5, depth=True)
@@ -86,6 +111,56 @@ def test_tensors_and_arrays_give_the_same(scattered):
     assert np.allclose(rgb.detach(), plain[0], atol=1e-5) and np.allclose(alpha.detach(), plain[1], atol=1e-5)
     several, *_ = freerange.render(*gaussians.values(), np.stack([c2w] * 3), k, width, height, torch.eye(3))
     assert several.shape == (3, height, width, 3)
+
+
+def harmonic(scattered, degree):
+    """Gaussians with harmonics, and two cameras: the second sees other colors."""
+    given, c2w, k, width, height = scattered
+    # Small enough that no color is cut off at 0, where there is no derivative.
+    sh = 0.03 * np.random.default_rng(5).normal(size=(5, (degree + 1) ** 2 - 1, 3))
+    given = dict(given, colors=0.3 + 0.4 * given["colors"])
+    other = c2w.copy()
+    other[:3, 3] += [0.6, 0.4, 0.3]
+    return freerange.Gaussians(**given, sh=sh if degree else None), np.stack([c2w, other]), (k, width, height)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_harmonics_are_those_of_arrays(scattered, degree):
+    gaussians, poses, camera = harmonic(scattered, degree)
+    made = gaussians.to_torch()
+    if not degree:
+        made["colors"] = (made["colors"][:, None] - 0.5) / 0.28209479177387814
+    assert made["colors"].shape == (5, (degree + 1) ** 2, 3)
+    for c2w in (poses, poses[1]):
+        found = freerange.render(**made, c2w=c2w, K=camera[0], width=8, height=6, depth=True)
+        for one, other in zip(found, gaussians.render(c2w, *camera, depth=True)):
+            assert one.shape == other.shape and np.abs(one.numpy() - other).max() < 1e-5
+    if degree:
+        plain = freerange.Gaussians.from_rows(gaussians.rows)
+        assert np.abs(plain.render(poses, *camera).rgb - gaussians.render(poses, *camera).rgb).max() > 1e-3
+    # Colors that would be negative are black.
+    made["colors"] = made["colors"] - 10.0
+    found = freerange.render(**made, c2w=poses, K=camera[0], width=8, height=6, background=0.0).rgb
+    assert (found == 0.0).all() if degree else (found < 0.0).any()
+    with pytest.raises(ValueError, match=r"colors: .*k of 1, 4, 9 or 16, found \[5, 2, 3\]"):
+        freerange.render(**(made | {"colors": torch.zeros(5, 2, 3)}), c2w=poses, K=camera[0])
+
+
+def test_gradients_of_harmonics_are_those_of_differences(scattered):
+    """In coefficients, backgrounds and means, which decide the viewing direction. Steps and tolerances are those of the test above."""
+    gaussians, poses, (k, width, height) = harmonic(scattered, 3)
+    made = {name: value.double() for name, value in gaussians.to_torch().items()}
+    background = torch.tensor([[0.2, 0.5, 0.9], [0.7, 0.1, 0.4]], dtype=torch.float64)
+    # Larger harmonics, so that the direction counts; a brighter constant, so that no color is cut off.
+    made["colors"][:, 1:] *= 4.0
+    made["colors"][:, 0] += 3.0
+
+    def pictures(means, colors, background):
+        changed = made | {"means": means, "colors": colors}
+        return tuple(freerange.render(**changed, c2w=poses, K=k, width=width, height=height, background=background)[:2])
+
+    arrays = [value.requires_grad_() for value in (made["means"].clone(), made["colors"].clone(), background)]
+    assert torch.autograd.gradcheck(pictures, arrays, eps=5e-3, atol=2e-3, rtol=1e-2, nondet_tol=0.0)
 
 
 def test_memory_is_shared(scattered):

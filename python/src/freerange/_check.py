@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Literal, Union
+import errno
+import os
+from collections.abc import Iterable, Sequence
+from os import PathLike
+from typing import TYPE_CHECKING, Any, Literal, Union
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +15,15 @@ Array = npt.NDArray[Any]
 Floats = npt.NDArray[np.float32]
 RawCamera = tuple[int, int, tuple[float, ...], list[list[float]]]
 Up = Union[str, tuple[float, float, float]]
+# What users give: arrays or tensors; three numbers; which way is up in the cameras' frame.
+if TYPE_CHECKING:
+    import torch
+
+    Arrays = Union[npt.ArrayLike, torch.Tensor]
+else:
+    Arrays = npt.ArrayLike
+Point = Union[Sequence[float], Array]
+Upright = Union[Literal["z", "y", "cameras"], Point]
 
 Convention = Literal["opencv", "opengl"]
 CONVENTIONS = ("opencv", "opengl")
@@ -77,6 +89,24 @@ def point(field: str, value: Any) -> tuple[float, float, float]:
     return (float(x), float(y), float(z))
 
 
+def corner(field: str, value: Any) -> Array:
+    """Three numbers, of which some may be infinite."""
+    found = array(field, value).astype(np.float64)
+    if found.shape != (3,):
+        raise refuse(field, "the shape [3]", list(found.shape))
+    if np.isnan(found).any():
+        raise refuse(field, "numbers or infinity", found.tolist())
+    return found
+
+
+def folder_of(path: str | PathLike[str]) -> None:
+    """Refuses a file in a folder that does not exist."""
+    folder = os.path.dirname(os.path.abspath(path))
+    if not os.path.isdir(folder):
+        number, found = (errno.ENOTDIR, "a file") if os.path.lexists(folder) else (errno.ENOENT, "none")
+        raise OSError(number, f"expected a folder to write to, found {found}", folder)
+
+
 def up(value: Any) -> Up:
     return value if isinstance(value, str) else point("up", value)
 
@@ -94,10 +124,12 @@ def gaussians(
     means: Any, scales: Any, quats: Any, opacities: Any, colors: Any
 ) -> tuple[Array, Array, Array, Array, Array]:
     """The five arrays; scales and quaternions in either order, which their shapes tell."""
-    if np.shape(scales)[-1:] == (4,) and np.shape(quats)[-1:] == (3,):
+    if gsplats_order(scales, quats):
         scales, quats = quats, scales
     means = shaped("means", means, (None, 3), "[n, 3]")
     n = len(means)
+    if np.shape(opacities) == (n, 1):
+        opacities = array("opacities", opacities)[:, 0]
     return (
         means,
         shaped("scales", scales, (n, 3), f"[{n}, 3]"),
@@ -105,6 +137,19 @@ def gaussians(
         shaped("opacities", opacities, (n,), f"[{n}]"),
         shaped("colors", colors, (n, 3), f"[{n}, 3]"),
     )
+
+
+def gsplats_order(scales: Any, quats: Any) -> bool:
+    """Whether what is called scales are quaternions, and the other way round."""
+    last = [tuple(getattr(a, "shape", None) or np.shape(a))[-1:] for a in (scales, quats)]
+    return last == [(4,), (3,)]
+
+
+def own_order(scales: Any, quats: Any, c2w: Any) -> None:
+    """Refuses gsplat's order with `c2w`, since its sixth argument is `viewmats`."""
+    if c2w is not None and gsplats_order(scales, quats):
+        ours = "c2w after means, scales, quats, opacities, colors; or viewmats=..., Ks=... by name in gsplat's order"
+        raise wrong_type("c2w", ours, "c2w after means, quats, scales, ...: gsplat has viewmats there")
 
 
 def coefficients(colors: Any, sh: Any) -> tuple[Any, Any]:
@@ -217,7 +262,11 @@ def cameras(
     if convention not in CONVENTIONS:
         raise refuse("convention", " or ".join(map(repr, CONVENTIONS)), f"{convention!r}")
     views = len(sizes)
-    k = shaped(k_name, intrinsics, (views, 3, 3), f"[{views}, 3, 3]").astype(np.float64)
+    k = array(k_name, intrinsics).astype(np.float64)
+    if k.shape not in ((views, 3, 3), (1, 3, 3), (3, 3)):
+        raise refuse(k_name, f"the shape [{views}, 3, 3], or [3, 3] for all views", list(k.shape))
+    finite(k_name, k)
+    k = np.broadcast_to(k, (views, 3, 3))
     poses = array("c2w", c2w)
     if poses.shape not in ((views, 4, 4), (views, 3, 4)):
         raise refuse("c2w", f"the shape [{views}, 4, 4] or [{views}, 3, 4]", list(poses.shape))
@@ -263,6 +312,32 @@ def _bytes(field: str, found: Array) -> npt.NDArray[np.uint8]:
     return np.rint(np.clip(found, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
+def _mask(field: str, value: Any, size: tuple[int, ...]) -> Array:
+    """A mask of an image of this size; integers as `uint8`."""
+    mask = array(field, value, "biuf", "bool, integers from 0 to 255, or floats from 0 to 1")
+    if mask.shape == (*size, 1):
+        mask = mask[..., 0]
+    if mask.shape != size:
+        raise refuse(field, f"the shape {list(size)} of its image", list(mask.shape))
+    if mask.dtype.kind in "iu" and mask.dtype != np.uint8:
+        if mask.min() < 0 or mask.max() > 255:
+            raise refuse(field, "integers from 0 to 255", f"{mask.min()} to {mask.max()}")
+        mask = mask.astype(np.uint8)
+    return mask
+
+
+def _white(masks: Iterable[Array | None]) -> np.uint8:
+    """The factor that makes masks of 8 bits reach 255: 255 where they hold 0 and 1, else 1. The maximum over all masks decides."""
+    largest = max((int(m.max()) for m in masks if m is not None and m.dtype == np.uint8 and m.size), default=0)
+    return np.uint8(255 if largest == 1 else 1)
+
+
+def no_scene(value: Any, instead: str) -> None:
+    """Refuses a scene, or the folder of one, where images are expected."""
+    if isinstance(value, (str, bytes, PathLike)) or hasattr(value, "_scene"):
+        raise wrong_type("images", f"an array [v, h, w, 3 or 4] ({instead})", type(value).__name__)
+
+
 def images(value: Any, masks: Any) -> list[npt.NDArray[np.uint8]]:
     """RGBA of 8 bits, each `[h, w, 4]`; opaque where nothing tells the object."""
     listed = _listed("images", value, "[v, h, w, 3 or 4]")
@@ -273,19 +348,24 @@ def images(value: Any, masks: Any) -> list[npt.NDArray[np.uint8]]:
         given = _listed("masks", masks, "[v, h, w]")
         if len(given) != len(listed):
             raise refuse("masks", f"one for each of {len(listed)} images", len(given))
-    result = []
+    pictures: list[Array] = []
+    outlines: list[Array | None] = []
     for i, (one, outline) in enumerate(zip(listed, given)):
         found = array(f"images[{i}]", one, expected="uint8, or floats from 0 to 1")
         if found.ndim != 3 or found.shape[2] not in (3, 4) or 0 in found.shape:
             raise refuse(f"images[{i}]", "the shape [h, w, 3] or [h, w, 4]", list(found.shape))
+        pictures.append(found)
+        outlines.append(None if outline is None else _mask(f"masks[{i}]", outline, found.shape[:2]))
+    of_alpha, of_masks = _white(p[..., 3] for p in pictures if p.shape[2] == 4), _white(outlines)
+    result = []
+    for i, (found, mask) in enumerate(zip(pictures, outlines)):
         rgba = np.full((*found.shape[:2], 4), 255, dtype=np.uint8)
         rgba[..., : found.shape[2]] = _bytes(f"images[{i}]", found)
-        if outline is not None:
-            mask = array(f"masks[{i}]", outline, "biuf", "bool, uint8, or floats from 0 to 1")
-            if mask.shape != found.shape[:2]:
-                raise refuse(f"masks[{i}]", f"the shape {list(found.shape[:2])} of its image", list(mask.shape))
-            share = _bytes(f"masks[{i}]", mask).astype(np.uint16)
-            rgba[..., 3] = rgba[..., 3] * share // 255
+        if found.shape[2] == 4 and found.dtype == np.uint8:
+            rgba[..., 3] *= of_alpha
+        if mask is not None:
+            share = _bytes(f"masks[{i}]", mask) * (of_masks if mask.dtype == np.uint8 else np.uint8(1))
+            rgba[..., 3] = rgba[..., 3] * share.astype(np.uint16) // 255
             rgba[rgba[..., 3] == 0] = 0
         result.append(rgba)
     return result

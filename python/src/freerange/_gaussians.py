@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import os
 import sys
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
@@ -9,16 +11,15 @@ from os import PathLike
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from . import _check, _core
-from ._check import Array, Convention, Floats
+from ._check import Array, Arrays, Convention, Floats, Point
 
 # Channels of a row: center (3), log of the deviations (3), rotation w x y z (4), logit of the opacity, color (3).
 CHANNELS = 14
 # Opacities of 0 and 1 have no finite logit.
 OPACITY_MARGIN = 1e-6
-
-
 # Coefficients of a channel without the constant, by degree of the spherical harmonics.
 SH_COEFFICIENTS = (0, 3, 8, 15)
 
@@ -27,13 +28,20 @@ class DroppedWarning(UserWarning):
     """Something that was given is left out, or may make the result wrong."""
 
 
+# Folder of this package.
+_PACKAGE = os.path.dirname(__file__)
+
+
 def heed(notes: Iterable[tuple[bool, str]]) -> list[str]:
     """The notes' sentences. Those of what is left out, or may be wrong, are warnings as well."""
     told = list(notes)
+    # A warning names the line of the user's that called this package, however deep the call is.
+    frame, level = inspect.currentframe(), 1
+    while frame is not None and os.path.dirname(frame.f_code.co_filename) == _PACKAGE:
+        frame, level = frame.f_back, level + 1
     for grave, text in told:
         if grave:
-            # The caller of the package's function that calls this.
-            warnings.warn(text, DroppedWarning, stacklevel=3)
+            warnings.warn(text, DroppedWarning, stacklevel=level)
     return [text for _, text in told]
 
 
@@ -81,14 +89,14 @@ class Gaussians:
 
     def __init__(
         self,
-        means: Any,
-        scales: Any,
-        quats: Any,
-        opacities: Any,
-        colors: Any,
+        means: npt.ArrayLike,
+        scales: npt.ArrayLike,
+        quats: npt.ArrayLike,
+        opacities: npt.ArrayLike,
+        colors: npt.ArrayLike,
         *,
-        sh: Any = None,
-        up: Any = (0.0, 0.0, 1.0),
+        sh: npt.ArrayLike | None = None,
+        up: Point = (0.0, 0.0, 1.0),
     ) -> None:
         """Makes Gaussians of arrays.
 
@@ -96,7 +104,7 @@ class Gaussians:
             means: `[n, 3]`, centers.
             scales: `[n, 3]`, standard deviations, above 0.
             quats: `[n, 4]`, rotations w x y z of any length. `scales` and `quats` may be exchanged, as gsplat has them.
-            opacities: `[n]`, from 0 to 1.
+            opacities: `[n]` or `[n, 1]`, from 0 to 1.
             colors: `[n, 3]`, sRGB-encoded, mostly from 0 to 1. Or `[n, 1 + k, 3]`, all coefficients of spherical harmonics, as
                 gsplat has them and `to_torch` gives them.
             sh: `[n, k, 3]` with k of 3, 8 or 15, spherical harmonics of degree 1 to 3 (gsplat's `shN`); none by default.
@@ -160,7 +168,7 @@ class Gaussians:
         return made
 
     @classmethod
-    def from_rows(cls, rows: Any, *, up: Any = (0.0, 0.0, 1.0)) -> Gaussians:
+    def from_rows(cls, rows: npt.ArrayLike, *, up: Point = (0.0, 0.0, 1.0)) -> Gaussians:
         """Makes Gaussians of rows.
 
         Args:
@@ -176,12 +184,13 @@ class Gaussians:
         return made
 
     @classmethod
-    def read(cls, path: str | PathLike[str], *, up: Any = (0.0, 0.0, 1.0)) -> Gaussians:
+    def read(cls, path: str | PathLike[str], *, up: Point | None = None) -> Gaussians:
         """Reads a .ply, .splat, .spz, .sog, .glb, .gltf, .usda or .usdz, or an .html that this program wrote.
 
         Args:
             path: the file.
             up: the direction of up in the frame that you want. Formats that fix theirs, as .glb, are turned into it.
+                None is what the file says (a comment of a .ply, a page), else +z.
 
         Raises:
             ValueError, OSError: the file, what was expected and what was found.
@@ -189,9 +198,8 @@ class Gaussians:
         Warns:
             DroppedWarning: something of the file is left out.
         """
-        direction = _check.point("up", up)
-        splats, notes = _core.read_gaussians(path, direction)
-        return cls._of_splats(splats, up=direction, notes=heed(notes))
+        splats, direction, notes = _core.read_gaussians(path, None if up is None else _check.point("up", up))
+        return cls._of_splats(splats, up=tuple(direction), notes=heed(notes))
 
     @classmethod
     def concat(cls, parts: Iterable[Gaussians]) -> Gaussians:
@@ -213,12 +221,12 @@ class Gaussians:
     def __len__(self) -> int:
         return len(self._rows)
 
-    def __getitem__(self, index: Any) -> Gaussians:
+    def __getitem__(self, index: int | slice | npt.ArrayLike) -> Gaussians:
         """Some of them: by a number, a slice, numbers, or a mask, as an array's rows."""
         if isinstance(index, (int, np.integer)) and not isinstance(index, bool):
             if not -len(self) <= index < len(self):
                 raise IndexError(f"Gaussian {index} of {len(self)}")
-            index = [index]
+            index = [int(index)]
         elif not isinstance(index, slice):
             index = _check.indices(index, len(self))
         return self._like(self._rows[index].copy(), self._sh[index].copy())
@@ -229,18 +237,18 @@ class Gaussians:
     def __add__(self, other: Gaussians) -> Gaussians:
         return Gaussians.concat([self, other]) if isinstance(other, Gaussians) else NotImplemented
 
-    def crop(self, low: Any, high: Any) -> Gaussians:
+    def crop(self, low: Point, high: Point) -> Gaussians:
         """Those whose centers lie in a box.
 
         Args:
-            low, high: `[3]`, corners of the box in their frame.
+            low, high: `[3]`, corners of the box in their frame; numbers may be infinite.
         """
-        least, most = np.array(_check.point("low", low)), np.array(_check.point("high", high))
+        least, most = _check.corner("low", low), _check.corner("high", high)
         if not (least < most).all():
             raise _check.refuse("high", f"a corner above low, {least.tolist()}", most.tolist())
         return self[((self._rows[:, 0:3] >= least) & (self._rows[:, 0:3] <= most)).all(axis=1)]
 
-    def transform(self, matrix: Any) -> Gaussians:
+    def transform(self, matrix: npt.ArrayLike) -> Gaussians:
         """Moved by a similarity. Harmonics and up turn with them.
 
         Args:
@@ -265,8 +273,14 @@ class Gaussians:
 
         Args:
             device: of the tensors, as PyTorch names it.
+
+        Raises:
+            ImportError: PyTorch is not installed.
         """
-        import torch
+        try:
+            import torch
+        except ImportError as error:
+            raise ImportError("to_torch: expected PyTorch, found none: pip install torch") from error
 
         colors = self.colors
         if self.sh_degree:
@@ -342,19 +356,20 @@ class Gaussians:
         Warns:
             DroppedWarning: the format cannot hold something, a sentence each.
         """
+        _check.folder_of(path)
         heed(_core.write_gaussians(*self._splats(), path, self.up))
 
     def render(
         self,
-        c2w: Any = None,
-        K: Any = None,
+        c2w: npt.ArrayLike | None = None,
+        K: npt.ArrayLike | None = None,
         width: int = 512,
         height: int = 512,
-        background: Any = 1.0,
+        background: npt.ArrayLike = 1.0,
         *,
-        viewmats: Any = None,
-        Ks: Any = None,
-        backgrounds: Any = None,
+        viewmats: npt.ArrayLike | None = None,
+        Ks: npt.ArrayLike | None = None,
+        backgrounds: npt.ArrayLike | None = None,
         convention: Convention = "opencv",
         depth: bool = False,
     ) -> Render:
@@ -396,11 +411,9 @@ def raw_cameras(
     poses, k = _check.array("c2w", c2w), _check.array("K", K)
     single = poses.ndim == 2
     if single:
-        poses, k = poses[None], k[None]
+        poses = poses[None]
     if poses.ndim != 3 or len(poses) == 0:
         raise _check.refuse("c2w", "the shape [4, 4] or [v, 4, 4]", list(poses.shape))
-    if not single and k.ndim == 2:
-        k = np.broadcast_to(k, (len(poses), *k.shape))
     cameras = _check.cameras(poses, k, [size] * len(poses), convention, "K")
     return cameras, _check.color("background", background, len(poses)), single
 
@@ -432,20 +445,20 @@ def _render(
 
 
 def render(
-    means: Any,
-    scales: Any,
-    quats: Any,
-    opacities: Any,
-    colors: Any,
-    c2w: Any = None,
-    K: Any = None,
+    means: Arrays,
+    scales: Arrays,
+    quats: Arrays,
+    opacities: Arrays,
+    colors: Arrays,
+    c2w: Arrays | None = None,
+    K: Arrays | None = None,
     width: int = 512,
     height: int = 512,
-    background: Any = 1.0,
+    background: Arrays = 1.0,
     *,
-    viewmats: Any = None,
-    Ks: Any = None,
-    backgrounds: Any = None,
+    viewmats: Arrays | None = None,
+    Ks: Arrays | None = None,
+    backgrounds: Arrays | None = None,
     convention: Convention = "opencv",
     depth: bool = False,
 ) -> Render:
@@ -456,9 +469,10 @@ def render(
 
     Args:
         means, scales, quats, opacities, colors: as `Gaussians` has them; gsplat's order (means, quats, scales, ...) is
-            known by the shapes. The sixth argument is `c2w` in either order: give gsplat's cameras by name.
+            known by the shapes. `colors` may hold all coefficients of spherical harmonics, as `to_torch` gives them.
+            With gsplat's order give its cameras by name, `viewmats=` and `Ks=`: the sixth argument is `c2w`.
         c2w: camera to world, `[4, 4]` or `[v, 4, 4]`; a fourth row may be left out. OpenCV's axes: x right, y down, z forward.
-        K: `[3, 3]` or `[v, 3, 3]`, in pixels; the center of the first pixel is at 0.5.
+        K: `[v, 3, 3]`, or `[3, 3]` for all, in pixels; the center of the first pixel is at 0.5.
         width, height: in pixels.
         background: a number, a color `[3]`, or one for each view; white by default.
         viewmats: world to camera instead of `c2w`, as gsplat has it.
@@ -473,27 +487,14 @@ def render(
     Raises:
         ValueError, TypeError: the field, what was expected and what was found.
     """
+    _check.own_order(scales, quats, c2w)
     poses, k = _check.cameras_given(c2w, viewmats, K, Ks, "K")
     background = _check.background_given(background, backgrounds)
-    torch = sys.modules.get("torch")
-    if torch is not None and any(isinstance(a, torch.Tensor) for a in (means, scales, quats, opacities, colors, background)):
-        from .torch import render as differentiable
+    loaded = sys.modules.get("torch")
+    if loaded is not None and any(isinstance(a, loaded.Tensor) for a in (means, scales, quats, opacities, colors, background)):
+        from .torch import _render as differentiable
 
-        return differentiable(
-            means, scales, quats, opacities, colors, poses, k, width, height, background, convention=convention, depth=depth
-        )
+        arrays = (means, scales, quats, opacities, colors)
+        return differentiable(*arrays, poses, k, width, height, background, convention, depth)
     made = Gaussians(means, scales, quats, opacities, colors)
     return _render(made, poses, k, width, height, background, convention, depth)
-
-
-def views_of(
-    told: list[tuple[str, tuple[int, int, tuple[float, ...], list[list[float]]], bytearray]],
-) -> tuple[list[str], list[Array], Array, Array]:
-    """Names, RGBA images, intrinsics and poses of views that the part in Rust told of."""
-    names, images, intrinsics, poses = [], [], [], []
-    for name, (width, height, (fx, fy, cx, cy), c2w), rgba in told:
-        names.append(name)
-        images.append(np.frombuffer(rgba, dtype=np.uint8).reshape(height, width, 4))
-        intrinsics.append([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        poses.append(c2w)
-    return names, images, np.array(intrinsics).reshape(-1, 3, 3), np.array(poses).reshape(-1, 4, 4)

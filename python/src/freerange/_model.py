@@ -9,9 +9,10 @@ from os import PathLike
 from typing import Any, Literal, overload
 
 import numpy as np
+import numpy.typing as npt
 
 from . import _check, _core
-from ._check import Convention
+from ._check import Convention, Point, Upright
 from ._gaussians import Gaussians, heed
 from ._scene import Scene
 
@@ -102,16 +103,16 @@ class Model:
     @overload
     def reconstruct(
         self,
-        images: Any,
-        intrinsics: Any = None,
-        c2w: Any = None,
-        masks: Any = None,
+        images: npt.ArrayLike,
+        intrinsics: npt.ArrayLike | None = None,
+        c2w: npt.ArrayLike | None = None,
+        masks: npt.ArrayLike | None = None,
         *,
-        viewmats: Any = None,
-        Ks: Any = None,
+        viewmats: npt.ArrayLike | None = None,
+        Ks: npt.ArrayLike | None = None,
         convention: Convention = "opencv",
-        up: Any = "z",
-        center: Any = None,
+        up: Upright = "z",
+        center: Point | None = None,
         radius: float | None = None,
         seed: int = 0,
         quality: Quality = "default",
@@ -126,16 +127,16 @@ class Model:
     @overload
     def reconstruct(
         self,
-        images: Any,
-        intrinsics: Any = None,
-        c2w: Any = None,
-        masks: Any = None,
+        images: npt.ArrayLike,
+        intrinsics: npt.ArrayLike | None = None,
+        c2w: npt.ArrayLike | None = None,
+        masks: npt.ArrayLike | None = None,
         *,
-        viewmats: Any = None,
-        Ks: Any = None,
+        viewmats: npt.ArrayLike | None = None,
+        Ks: npt.ArrayLike | None = None,
         convention: Convention = "opencv",
-        up: Any = "z",
-        center: Any = None,
+        up: Upright = "z",
+        center: Point | None = None,
         radius: float | None = None,
         seed: Sequence[int],
         quality: Quality = "default",
@@ -149,16 +150,16 @@ class Model:
     ) -> list[Gaussians]: ...
     def reconstruct(
         self,
-        images: Any,
-        intrinsics: Any = None,
-        c2w: Any = None,
-        masks: Any = None,
+        images: npt.ArrayLike,
+        intrinsics: npt.ArrayLike | None = None,
+        c2w: npt.ArrayLike | None = None,
+        masks: npt.ArrayLike | None = None,
         *,
-        viewmats: Any = None,
-        Ks: Any = None,
+        viewmats: npt.ArrayLike | None = None,
+        Ks: npt.ArrayLike | None = None,
         convention: Convention = "opencv",
-        up: Any = "z",
-        center: Any = None,
+        up: Upright = "z",
+        center: Point | None = None,
         radius: float | None = None,
         seed: int | Sequence[int] = 0,
         quality: Quality = "default",
@@ -175,15 +176,17 @@ class Model:
         Args:
             images: `[v, h, w, 3]` or `[v, h, w, 4]` (alpha is the object's mask), `uint8` or floats from 0 to 1,
                 sRGB-encoded; a sequence where their sizes differ.
-            intrinsics: `[v, 3, 3]`, in pixels; the center of the first pixel is at 0.5.
+            intrinsics: `[v, 3, 3]`, or `[3, 3]` for all views, in pixels; the center of the first pixel is at 0.5.
             c2w: camera to world, `[v, 4, 4]` or `[v, 3, 4]`, in OpenCV's axes (x right, y down, z forward).
-            masks: `[v, h, w]`, bool, `uint8` or floats; white is the object. Without them and without alpha a plain
+            masks: `[v, h, w]` or `[v, h, w, 1]`, white is the object: bool, floats from 0 to 1, or integers. The largest
+                value of all masks of integers is 255 or 1; that of alpha, too. Without masks and without alpha a plain
                 background is cut away, else poses and colors show the object (`notes` of the result says how sure).
             viewmats: world to camera instead of `c2w`, as gsplat has it.
             Ks: the same as `intrinsics`.
             convention: "opengl" for OpenGL's and Blender's axes (y up, z backward).
-            up: which way is up in the cameras' frame: "z", "y", "cameras" or a direction.
-                COLMAP's frames have no upright z: pass "cameras", or a `Scene` to `reconstruct_scene`.
+            up: which way is up in the cameras' frame: "z" and "y" are its third and second axis, "cameras" goes by how
+                they are held; or a direction. COLMAP's frames have no upright z: pass "cameras", or give
+                `reconstruct_scene` a `Scene`, which finds it (`Scene.read`, `Scene.from_pycolmap`).
             center, radius: where the object is, if that is known.
             seed: a number, or several for a list of as many samples.
             quality: "draft", "default" or "high"; the options that follow are the preset's if they are None.
@@ -205,6 +208,7 @@ class Model:
         Warns:
             DroppedWarning: something given is left out, or may make the result wrong.
         """
+        _check.no_scene(images, "reconstruct_scene takes a Scene or a folder")
         poses, k = _check.cameras_given(c2w, viewmats, intrinsics, Ks, "intrinsics")
         seeds, chosen = _options(seed, quality, iterations, symmetry, init, precision, network_views, set)
         rgba = _check.images(images, masks)
@@ -213,8 +217,12 @@ class Model:
         views = [(f"images[{i}]", camera, p.tobytes()) for i, (camera, p) in enumerate(zip(cameras, rgba))]
         center = None if center is None else _check.point("center", center)
         radius = None if radius is None else _check.number("radius", radius)
-        result = self._model.reconstruct(views, chosen, _check.up(up), center, radius, _told(on_step))
-        return _made(result, heed(result[2]), seeds, seed)
+        report = _told(on_step)
+        # Before masks are looked for, which takes its time.
+        self._model.check(chosen)
+        scene = _core.scene_of_views(views, _check.up(up), center, radius)
+        heed(scene.notes())
+        return self._reconstruct(scene, chosen, report, seeds, seed)
 
     @overload
     def reconstruct_scene(
@@ -277,10 +285,22 @@ class Model:
             DroppedWarning: something of the scene is left out, or may make the result wrong.
         """
         seeds, chosen = _options(seed, quality, iterations, symmetry, init, precision, network_views, set)
+        if not isinstance(scene, (Scene, str, PathLike)):
+            raise _check.wrong_type("scene", "a Scene or a folder (reconstruct takes arrays)", type(scene).__name__)
+        report = _told(on_step)
         if not isinstance(scene, Scene):
+            self._model.check(chosen)
             scene = Scene.read(scene)
-        result = self._model.reconstruct_scene(scene._scene, chosen, _told(on_step))
-        return _made(result, heed(result[2]), seeds, seed)
+        return self._reconstruct(scene._scene, chosen, report, seeds, seed)
+
+    def _reconstruct(
+        self, scene: _core.Scene, chosen: dict[str, Any], report: Any, seeds: list[int], seed: int | Sequence[int]
+    ) -> Gaussians | list[Gaussians]:
+        """Of a scene whose notes were heeded when it was made."""
+        result = self._model.reconstruct_scene(scene, chosen, report)
+        known = len(scene.notes())
+        notes = [text for _, text in result[2][:known]] + heed(result[2][known:])
+        return _made(result, notes, seeds, seed)
 
 
 def _options(

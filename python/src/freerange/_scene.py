@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 import numpy as np
+import numpy.typing as npt
 
 from . import _check, _core
-from ._check import Array, Convention
-from ._gaussians import heed, views_of
+from ._check import Array, Convention, Point, Upright
+from ._gaussians import heed
 
 Masks = Literal["auto", "alpha", "plain", "estimate"]
 CameraFormat = Literal["transforms", "colmap", "polycam", "metashape", "realitycapture", "opf"]
@@ -52,8 +53,8 @@ class Scene:
         *,
         masks: Masks | str | PathLike[str] = "auto",
         invert_masks: bool = False,
-        up: Any = "auto",
-        center: Any = None,
+        up: Upright | Literal["auto"] = "auto",
+        center: Point | None = None,
         radius: float | None = None,
         max_side: int = 1024,
         images: str | PathLike[str] | None = None,
@@ -98,17 +99,17 @@ class Scene:
     @classmethod
     def from_arrays(
         cls,
-        images: Any,
-        intrinsics: Any = None,
-        c2w: Any = None,
-        masks: Any = None,
+        images: npt.ArrayLike,
+        intrinsics: npt.ArrayLike | None = None,
+        c2w: npt.ArrayLike | None = None,
+        masks: npt.ArrayLike | None = None,
         *,
-        viewmats: Any = None,
-        Ks: Any = None,
+        viewmats: npt.ArrayLike | None = None,
+        Ks: npt.ArrayLike | None = None,
         names: Sequence[str] | None = None,
         convention: Convention = "opencv",
-        up: Any = "z",
-        center: Any = None,
+        up: Upright = "z",
+        center: Point | None = None,
         radius: float | None = None,
     ) -> Scene:
         """Makes a scene of arrays, and cuts the object out.
@@ -123,6 +124,7 @@ class Scene:
         Warns:
             DroppedWarning: something given is left out, or may make the result wrong.
         """
+        _check.no_scene(images, "Scene.read takes a folder")
         poses, k = _check.cameras_given(c2w, viewmats, intrinsics, Ks, "intrinsics")
         rgba = _check.images(images, masks)
         sizes = [(image.shape[1], image.shape[0]) for image in rgba]
@@ -143,8 +145,8 @@ class Scene:
         *,
         masks: Masks | str | PathLike[str] = "auto",
         invert_masks: bool = False,
-        up: Any = "auto",
-        center: Any = None,
+        up: Upright | Literal["auto"] = "auto",
+        center: Point | None = None,
         radius: float | None = None,
         max_side: int = 1024,
     ) -> Scene:
@@ -184,8 +186,8 @@ class Scene:
     def _of(cls, scene: _core.Scene) -> Scene:
         made = cls.__new__(cls)
         made._scene = scene
-        made.names, made.images, made.intrinsics, made.c2w = views_of(scene.views())
-        made.further = views_of(scene.further())
+        made.names, made.images, made.intrinsics, made.c2w = _views_of(scene.views())
+        made.further = _views_of(scene.further())
         made.notes = heed(scene.notes())
         return made
 
@@ -204,3 +206,14 @@ class Scene:
 
     def __repr__(self) -> str:
         return f"<freerange.Scene: {len(self)} views, {len(self.further[0])} further>"
+
+
+def _views_of(told: list[tuple[str, _check.RawCamera, bytearray]]) -> tuple[list[str], list[Array], Array, Array]:
+    """Names, RGBA images, intrinsics and poses of views that the part in Rust told of."""
+    names, images, intrinsics, poses = [], [], [], []
+    for name, (width, height, (fx, fy, cx, cy), c2w), rgba in told:
+        names.append(name)
+        images.append(np.frombuffer(rgba, dtype=np.uint8).reshape(height, width, 4))
+        intrinsics.append([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        poses.append(c2w)
+    return names, images, np.array(intrinsics).reshape(-1, 3, 3), np.array(poses).reshape(-1, 4, 4)

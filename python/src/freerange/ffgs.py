@@ -28,6 +28,7 @@ except ImportError as error:
     raise ImportError(f"freerange.ffgs: expected PyTorch and ffgs: pip install ffgs ({error})") from error
 
 from . import _check
+from ._check import Arrays, Upright
 from ._gaussians import Gaussians
 from ._model import Quality, load
 
@@ -58,19 +59,27 @@ class FreeRange(torch.nn.Module, PyTorchModelHubMixin):
         self.register_buffer("_none", torch.zeros(1))
 
     def forward(self, samples: list[dict[str, Any]]) -> list[Gaussians]:
-        """One set of Gaussians for each sample, in the frame of its cameras."""
+        """One set of Gaussians for each sample, in the frame of its cameras.
+
+        Args:
+            samples: arguments of `Model.reconstruct`, as `FreeRangeProcessor.preprocess` makes them.
+        """
         return [self.model.reconstruct(**sample, **self.options) for sample in samples]
 
 
 @dataclass
 class FreeRangeConfig:
-    """Settings of the processor."""
+    """Settings of the processor.
 
-    #: Which way is up in the frame of the cameras: "z", "y", "cameras" or a direction.
-    up: Any = "z"
-    #: Color behind the Gaussians in renders.
+    Attributes:
+        up: which way is up in the frame of the cameras: "z", "y", "cameras" or a direction.
+        background: color behind the Gaussians in renders.
+        near: nearest depth of renders, in the cameras' units.
+        far: farthest depth of renders, in the cameras' units.
+    """
+
+    up: Upright = "z"
     background: list[float] = field(default_factory=lambda: [1.0, 1.0, 1.0])
-    #: Nearest and farthest depth of renders, in the cameras' units.
     near: float = 1e-2
     far: float = 1e4
 
@@ -81,7 +90,7 @@ class FreeRangeProcessor(Processor):
     config_cls = FreeRangeConfig
     camera_input = "required"
 
-    def preprocess(self, views: Views, device: torch.device, masks: Any = None) -> Prepared:
+    def preprocess(self, views: Views, device: torch.device, masks: Arrays | None = None) -> Prepared:
         """Views, with masks where there are any.
 
         Args:
@@ -111,7 +120,11 @@ class FreeRangeProcessor(Processor):
         return Prepared(samples, ModelFrame(here, 1.0))
 
     def postprocess(self, model_output: list[Gaussians]) -> Splats:
-        """Batched Gaussians; where samples have fewer than others, invisible ones follow."""
+        """Batched Gaussians; where samples have fewer than others, invisible ones follow.
+
+        Args:
+            model_output: Gaussians of each sample.
+        """
         most = max(len(g) for g in model_output)
 
         def batch(name: str, filler: list[float] | float) -> torch.Tensor:
@@ -129,7 +142,11 @@ class FreeRangeProcessor(Processor):
         )
 
     def render_planes(self, frame: ModelFrame | None) -> tuple[float, float]:
-        """Nearest and farthest depth."""
+        """Nearest and farthest depth.
+
+        Args:
+            frame: not used; the settings are in the cameras' units.
+        """
         return self.config.near, self.config.far
 
     @property
@@ -144,7 +161,7 @@ SPEC = ModelSpec("freerange", FreeRange, FreeRangeProcessor, display_name="free-
 
 def pipeline(
     *,
-    up: Any = "z",
+    up: Upright = "z",
     checkpoint: str | None = None,
     device: str = "auto",
     quality: Quality = "default",

@@ -157,8 +157,8 @@ fn merged(inputs: &[PathBuf], mut frames: Frames) -> Result<(Splats, Frame), Cli
     let mut all: Option<(Splats, Frame)> = None;
     for input in inputs {
         let loaded = read(input, frames)?;
-        let of = |note| if inputs.len() > 1 { format!("{}: {note}", input.display()) } else { note };
-        loaded.notes.into_iter().for_each(|note| eprintln!("note: {}", of(note)));
+        let of = if inputs.len() > 1 { format!("{}: ", input.display()) } else { String::new() };
+        loaded.notes.iter().for_each(|note| eprintln!("note: {of}{}", note.text));
         match &mut all {
             None => all = Some((loaded.splats, loaded.frame)),
             Some((splats, _)) => splats.append(&loaded.splats),

@@ -49,7 +49,7 @@ fn parse_mode(text: &str) -> Result<RenderMode, String> {
 pub fn run(args: &Args) -> Result<(), CliError> {
     let Loaded { splats, notes, .. } = read(&args.file, args.frame)?;
     for note in notes {
-        eprintln!("note: {note}");
+        eprintln!("{note}");
     }
     // Some writers of .spz mark all of their files.
     let told = if Format::of_input(&args.file)? == Format::Spz { RenderMode::Default } else { splats.mode };

@@ -14,7 +14,7 @@ use crate::ply_file::PlyFile;
 use crate::ply_header::{Element, read_header};
 use crate::ply_values::Values;
 use crate::{Gaussians, Harmonics, RenderMode, SplatError, Splats, channel, coefficients};
-use freerange_util::{IoError, write_atomically};
+use freerange_util::{IoError, Note, write_atomically};
 use glam::DVec3;
 use std::io::{self, BufRead, BufReader, Write};
 use std::{fs::File, path::Path};
@@ -63,7 +63,8 @@ pub fn parse_ply(mut reader: impl BufRead, file: &Path) -> Result<PlyFile, Splat
     notes.extend(rows.notes());
     let zero = cloud.iter().filter(|row| row[channel::ROTATION].iter().all(|v| *v == 0.0)).count();
     if zero > 0 {
-        notes.push(format!("{zero} Gaussians have a rotation of length zero, which stands for none"));
+        let text = format!("{zero} Gaussians have a rotation of length zero, which stands for none");
+        notes.push(Note::understood(text));
     }
     let mut splats = Splats {
         harmonics: Harmonics::from_rows(plan.degree, rows.harmonics),
@@ -89,16 +90,17 @@ struct Rows {
 }
 
 impl Rows {
-    fn notes(&self) -> Vec<String> {
+    fn notes(&self) -> Vec<Note> {
         let mut notes = Vec::new();
         if self.dropped > 0 {
-            notes.push(format!("{} Gaussians with numbers that are not finite are left out", self.dropped));
+            let text = format!("{} Gaussians with numbers that are not finite are left out", self.dropped);
+            notes.push(Note::dropped(text));
         }
         if self.clamped > 0 {
-            notes.push(format!(
+            notes.push(Note::changed(format!(
                 "{} Gaussians have an infinite opacity or log-scale, taken as the nearest finite one",
                 self.clamped
-            ));
+            )));
         }
         notes
     }

@@ -6,6 +6,7 @@ use crate::gaussians::Row;
 use crate::ply_error::{listed, property_error};
 use crate::ply_header::{Element, Header, Kind, Scalar};
 use crate::{MAX_DEGREE, RenderMode, SplatError, channel, coefficients};
+use freerange_util::Note;
 
 /// Columns of the files we write: a channel, or a zero (the normal that nobody uses).
 pub(crate) const COLUMNS: [(&str, Option<usize>); 17] = [
@@ -122,30 +123,31 @@ impl Plan {
     }
 
     /// What is left out or looks odd.
-    pub fn notes(&self, header: &Header, vertex: usize) -> Vec<String> {
+    pub fn notes(&self, header: &Header, vertex: usize) -> Vec<Note> {
         let mut notes = Vec::new();
         if self.flat {
-            notes.push("2D Gaussians (no property scale_2): their third standard deviation is next to nothing".into());
+            let text = "2D Gaussians (no property scale_2): their third standard deviation is next to nothing";
+            notes.push(Note::understood(text));
         }
         let names = || header.elements[vertex].properties.iter().map(|p| p.name.as_str());
         let kept = 3 * coefficients(self.degree);
         let rest = names().filter(|name| name.starts_with(REST)).count();
         if rest > kept {
-            notes.push(format!(
+            notes.push(Note::dropped(format!(
                 "{} of {rest} properties f_rest_* (color that depends on the viewing direction) are left out: degrees 1 \
                  to {MAX_DEGREE} have 9, 24 and 45",
                 rest - kept
-            ));
+            )));
         }
         let known = |name: &str| COLUMNS.iter().any(|(column, _)| *column == name) || name.starts_with(REST);
         let others: Vec<_> =
             names().zip(&self.columns).filter(|(n, c)| **c == Column::Other && !known(n)).map(|(n, _)| n).collect();
         if !others.is_empty() {
-            notes.push(format!("properties left out: {}", listed(&others)));
+            notes.push(Note::dropped(format!("properties left out: {}", listed(&others))));
         }
         let others: Vec<_> = header.elements.iter().map(|e| e.name.as_str()).filter(|name| *name != "vertex").collect();
         if !others.is_empty() {
-            notes.push(format!("elements left out: {}", listed(&others)));
+            notes.push(Note::dropped(format!("elements left out: {}", listed(&others))));
         }
         notes
     }

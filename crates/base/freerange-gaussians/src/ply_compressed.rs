@@ -12,6 +12,7 @@ use crate::ply_file::PlyFile;
 use crate::ply_header::{Element, Header, Kind, Scalar};
 use crate::ply_values::Values;
 use crate::{Gaussians, Harmonics, MAX_DEGREE, SplatError, Splats, channel, coefficients};
+use freerange_util::Note;
 use std::{io::BufRead, path::Path};
 
 /// Gaussians per chunk.
@@ -108,7 +109,7 @@ fn harmonics<R: BufRead>(
     header: &Header,
     at: usize,
     count: u64,
-) -> Result<(Harmonics, Vec<String>), SplatError> {
+) -> Result<(Harmonics, Vec<Note>), SplatError> {
     let Some(offset) = header.elements[at + 1..].iter().position(|e| e.name == "sh") else {
         return Ok((Harmonics::default(), Vec::new()));
     };
@@ -147,8 +148,8 @@ fn harmonics<R: BufRead>(
         Ok(())
     })?;
     let left = rest - 3 * width;
-    let notes =
-        (left > 0).then(|| format!("{left} of {rest} properties f_rest_* are left out: beyond degree {MAX_DEGREE}"));
+    let text = || format!("{left} of {rest} properties f_rest_* are left out: beyond degree {MAX_DEGREE}");
+    let notes = (left > 0).then(|| Note::dropped(text()));
     Ok((Harmonics::from_rows(degree, data), notes.into_iter().collect()))
 }
 

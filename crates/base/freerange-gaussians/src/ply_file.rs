@@ -1,6 +1,7 @@
 //! What is read of a `.ply` file.
 
 use crate::Splats;
+use freerange_util::Note;
 use glam::DVec3;
 
 /// What a `.ply` holds.
@@ -11,5 +12,5 @@ pub struct PlyFile {
     /// Which way is up, where the file says so.
     pub up: Option<DVec3>,
     /// What was left out or looks odd, one sentence each, for the user.
-    pub notes: Vec<String>,
+    pub notes: Vec<Note>,
 }

@@ -47,7 +47,7 @@ const HALF: f64 = 0.5 / 255.0 + 1e-6;
 #[test]
 fn standard_ply() {
     let loaded = golden("source.ply", Frame::Z_UP);
-    assert_eq!((loaded.notes, loaded.splats.harmonics.degree()), (Vec::<String>::new(), 1));
+    assert_eq!((loaded.notes, loaded.splats.harmonics.degree()), (Vec::new(), 1));
 }
 
 #[test]

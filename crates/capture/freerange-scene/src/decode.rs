@@ -17,6 +17,8 @@ pub(crate) struct Decoded {
     pub orientation: Orientation,
     /// Whether its colors were others than sRGB's.
     pub converted: bool,
+    /// What its color profile is of, where that is not used.
+    pub profile: Option<&'static str>,
 }
 
 /// Decodes a file.
@@ -27,8 +29,12 @@ pub(crate) fn decode(path: &Path) -> Result<Decoded, SceneError> {
     // What cannot be read of a profile changes no color.
     let profile = decoder.icc_profile().ok().flatten();
     let mut image = DynamicImage::from_decoder(decoder).map_err(failed)?.into_rgba8();
-    let converted = profile.is_some_and(|profile| to_srgb(&mut image, &profile));
-    Ok(Decoded { image, orientation, converted })
+    let (converted, profile) = match profile.map(|profile| to_srgb(&mut image, &profile)) {
+        None => (false, None),
+        Some(Ok(converted)) => (converted, None),
+        Some(Err(kind)) => (false, Some(kind)),
+    };
+    Ok(Decoded { image, orientation, converted, profile })
 }
 
 /// Whether a file may have transparent pixels, from its beginning.
@@ -66,35 +72,36 @@ fn kind_of(path: &Path) -> Option<&'static str> {
 /// Colors that differ from sRGB's by no more than this are left as they are, in 8-bit steps.
 const SAME_COLOR: u8 = 2;
 
-/// Turns an image with this ICC profile into sRGB; whether anything changed. Profiles other than of red, green and blue are passed over.
-fn to_srgb(image: &mut RgbaImage, profile: &[u8]) -> bool {
-    let Ok(own) = moxcms::ColorProfile::new_from_slice(profile) else { return false };
+/// Turns an image with this ICC profile into sRGB; whether anything changed. Profiles that are not of red, green and
+/// blue are passed over: what they are of is the error.
+fn to_srgb(image: &mut RgbaImage, profile: &[u8]) -> Result<bool, &'static str> {
+    let unreadable = |_| "unreadable";
+    let own = moxcms::ColorProfile::new_from_slice(profile).map_err(unreadable)?;
     let (layout, options) = (moxcms::Layout::Rgba, moxcms::TransformOptions::default());
-    if own.color_space != moxcms::DataColorSpace::Rgb {
-        return false;
+    match own.color_space {
+        moxcms::DataColorSpace::Rgb => {}
+        moxcms::DataColorSpace::Gray => return Err("gray"),
+        moxcms::DataColorSpace::Cmyk => return Err("CMYK"),
+        _ => return Err("other colors"),
     }
-    let Ok(transform) = own.create_transform_8bit(layout, &moxcms::ColorProfile::new_srgb(), layout, options) else {
-        return false;
-    };
+    let srgb = moxcms::ColorProfile::new_srgb();
+    let transform = own.create_transform_8bit(layout, &srgb, layout, options).map_err(unreadable)?;
     let probes: Vec<u8> = (0..27u32)
         .flat_map(|i| [i % 3, i / 3 % 3, i / 9].map(|v| 40 + 85 * v as u8).into_iter().chain([255]))
         .collect();
     let mut shown = vec![0; probes.len()];
-    let same = transform.transform(&probes, &mut shown).is_err()
-        || probes.iter().zip(&shown).all(|(a, b)| a.abs_diff(*b) <= SAME_COLOR);
-    if same {
-        return false;
+    transform.transform(&probes, &mut shown).map_err(unreadable)?;
+    if probes.iter().zip(&shown).all(|(a, b)| a.abs_diff(*b) <= SAME_COLOR) {
+        return Ok(false);
     }
     // Row by row: no second image.
     let width = 4 * image.width() as usize;
     let mut row = vec![0; width];
     for pixels in image.chunks_exact_mut(width.max(4)) {
-        if transform.transform(pixels, &mut row).is_err() {
-            return false;
-        }
+        transform.transform(pixels, &mut row).map_err(unreadable)?;
         pixels.copy_from_slice(&row);
     }
-    true
+    Ok(true)
 }
 
 /// Width and height of an image file, from its beginning.

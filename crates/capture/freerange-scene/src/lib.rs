@@ -22,7 +22,9 @@ mod write;
 
 pub use error::SceneError;
 pub use freerange_util::{Note, NoteKind};
-pub use load::{KeepWhole, LoadConfig, Loaded, MaskKind, MaskSource, Whole, cut, files, load, up_of, write_masks};
+pub use load::{
+    KeepWhole, LoadConfig, Loaded, MaskKind, MaskSource, Whole, cut, files, load, mask_file, up_of, write_masks,
+};
 pub use mask_model::{MaskModel, PixelRange};
 pub use open::{Scene, SceneConfig, views_to_compare};
 pub use write::write_colmap;

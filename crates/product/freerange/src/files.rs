@@ -4,29 +4,34 @@ use std::path::Path;
 
 use freerange_gaussians::{
     Gaussians, Splats,
-    formats::{Frame, WriteOptions, read, write},
+    formats::{Frame, Frames, WriteOptions, read, write},
 };
 use freerange_util::Note;
 use glam::DVec3;
 
 use crate::{Error, error::Lift};
 
-/// Reads Gaussians (`.ply`, `.splat`, `.spz`, `.sog`, `.glb`, `.gltf`, `.usda`, `.usdz`) with all that the file has of them. Formats
-/// that fix which way is up are turned so that `up` is.
+/// Reads Gaussians (`.ply`, `.splat`, `.spz`, `.sog`, `.glb`, `.gltf`, `.usda`, `.usdz`) with all that the file has of
+/// them, and which way is up in their frame. That is `up`, to which formats that fix theirs are turned; where there is
+/// none, what the file says (a comment of a `.ply`), else +z.
 ///
 /// # Errors
 /// Names the file, the place in it, what was expected and what was found.
-pub fn read_splats(path: &Path, up: DVec3) -> Result<(Splats, Vec<Note>), Error> {
-    let loaded = read(path, frame(up)?).lift()?;
-    Ok((loaded.splats, loaded.notes.into_iter().map(Note::understood).collect()))
+pub fn read_splats(path: &Path, up: Option<DVec3>) -> Result<(Splats, DVec3, Vec<Note>), Error> {
+    let to = up.map(frame).transpose()?;
+    let loaded = read(path, Frames { from: None, to }).lift()?;
+    // Without what rounding leaves of zeros.
+    let clean = loaded.frame.up().map(|v| (v * 1e12).round() / 1e12 + 0.0);
+    Ok((loaded.splats, up.unwrap_or(clean), loaded.notes))
 }
 
-/// The same without what depends on the viewing direction; a note says what is left out.
+/// The same in the frame in which `up` is up, without what depends on the viewing direction; a note says what is left
+/// out.
 ///
 /// # Errors
 /// As [`read_splats`].
 pub fn read_gaussians(path: &Path, up: DVec3) -> Result<(Gaussians, Vec<Note>), Error> {
-    let (splats, mut notes) = read_splats(path, up)?;
+    let (splats, _, mut notes) = read_splats(path, Some(up))?;
     let degree = splats.harmonics.degree();
     if degree > 0 {
         let text = format!("color that depends on the viewing direction (degree {degree}) is left out");
@@ -60,7 +65,7 @@ fn frame(up: DVec3) -> Result<Frame, Error> {
 
 #[cfg(test)]
 mod tests {
-    use freerange_gaussians::{channel, formats::Frames};
+    use freerange_gaussians::channel;
 
     use super::*;
 
@@ -86,6 +91,10 @@ mod tests {
         let same = &loaded.splats.cloud;
         assert!(loaded.frame.up().distance(up) < 1e-8, "{:?}", loaded.frame.up());
         assert!((0..4).all(|i| same.mean(i) == cloud.mean(i)), "not turned");
+        // What the file says, unless the caller does; +z where nobody does.
+        let read_up = |name: &str, up| read_splats(&folder.join(name), up).unwrap().1;
+        assert!(read_up("b.ply", None).distance(up) < 1e-8 && read_up("b.ply", Some(DVec3::Y)) == DVec3::Y);
+        assert_eq!([read_up("a.glb", None), read_up("a.splat", None)], [DVec3::Z; 2]);
         let of = |name: &str, up| write_gaussians(&cloud, &folder.join(name), up).unwrap_err();
         assert!(matches!(of("a.ply", DVec3::ZERO), Error::Input { field, .. } if field == "up"));
         assert!(matches!(of("a.txt", DVec3::Z), Error::Gaussians(_)));

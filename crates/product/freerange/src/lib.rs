@@ -62,6 +62,7 @@ mod progress;
 mod reconstructor;
 mod scene;
 mod score;
+mod warnings;
 
 pub use checkpoint::EncoderPlaces;
 pub use config::{
@@ -81,11 +82,12 @@ pub use freerange_scene::{
     estimate::Hints,
     read::{Cameras, Format as CameraFormat, ReadConfig, Turntable},
 };
-pub use freerange_util::{Note, NoteKind};
+pub use freerange_util::{Note, NoteKind, Stop};
 pub use glam;
 pub use image;
 pub use pipeline::{Reconstruction, Sample};
 pub use progress::{Progress, Stage};
 pub use reconstructor::Reconstructor;
-pub use scene::{Scene, cut_out};
+pub use scene::{Scene, cut_out, load_views};
 pub use score::{Scores, ViewScore, score};
+pub use warnings::warnings_of;

@@ -2,16 +2,15 @@
 
 use std::path::Path;
 
-use freerange_scene::camera::{FrameConfig, View, canonical_from_user};
+use freerange_scene::camera::{FrameConfig, View};
 use freerange_scene::{
-    Loaded, SceneConfig, cut,
+    Loaded, MaskKind, SceneConfig, Whole, cut,
     estimate::Hints,
-    inspect::view_warnings,
     read::{Cameras, cameras_with},
 };
-use freerange_util::Note;
+use freerange_util::{Note, Stop};
 
-use crate::{Error, choose_views, error::Lift, leave_one_out::leave_one_out};
+use crate::{Error, error::Lift, frame::check_cameras, leave_one_out::leave_one_out, warnings::warnings_of};
 
 /// Photos with cameras, read and cut out.
 #[derive(Clone, Debug)]
@@ -71,9 +70,7 @@ impl Scene {
     /// # Errors
     /// If the views do not show one object from different places.
     pub fn warnings(&self, network_views: usize) -> Result<Vec<Note>, Error> {
-        let frame = canonical_from_user(self.views(), &self.frame).lift()?;
-        let shown = choose_views(self.views(), network_views)?;
-        Ok(view_warnings(&self.loaded, &frame, &shown).into_iter().map(Note::warning).collect())
+        warnings_of(&self.loaded, &self.frame, network_views)
     }
 }
 
@@ -81,7 +78,25 @@ impl Scene {
 /// [`Scene`] do. `hints` say what is known of the object's place.
 ///
 /// # Errors
-/// If no mask can be found.
+/// If no mask can be found, or all cameras stand at one place.
 pub fn cut_out(views: &mut [View], hints: &Hints) -> Result<Vec<Note>, Error> {
-    cut(views, &Hints { others: hints.others.or(Some(leave_one_out)), ..*hints }).lift()
+    cut_out_until(views, hints, &Stop::default())
+}
+
+fn cut_out_until(views: &mut [View], hints: &Hints, stop: &Stop) -> Result<Vec<Note>, Error> {
+    check_cameras(views)?;
+    cut(views, &Hints { others: hints.others.or(Some(leave_one_out)), ..*hints }, stop).lift()
+}
+
+/// [`cut_out`] of views as [`Scene::loaded`] is of photos that are read: [`warnings_of`] takes it.
+///
+/// # Errors
+/// As there; [`Error::Cancelled`] once it is stopped.
+pub fn load_views(mut views: Vec<View>, hints: &Hints, stop: &Stop) -> Result<Loaded, Error> {
+    let notes = match (cut_out_until(&mut views, hints, stop), stop.check()) {
+        (_, Err(_)) => return Err(Error::Cancelled),
+        (notes, Ok(())) => notes?,
+    };
+    let (photos, whole) = ((0..views.len()).collect(), Whole::default());
+    Ok(Loaded { views, photos, whole, further: Vec::new(), masks: MaskKind::Alpha, estimate: None, notes })
 }

@@ -330,6 +330,60 @@ fn what_cannot_be_used_is_named() {
     assert!(model.run(&views, &with(&|o| o.seeds.clear()), &mut go).unwrap().samples.is_empty());
 }
 
+/// World to camera where camera to world is expected: whatever the rounding, wherever masks come from.
+#[test]
+fn cameras_at_one_place_are_refused() {
+    let bowl = bowl();
+    let inverted = |shake: f64, shift: DVec3| {
+        let of = |(i, v): (usize, &View)| {
+            let mut camera = v.camera;
+            camera.world_to_camera.w_axis += (shake * DVec3::new(i as f64, -1.0, (3 * i % 2) as f64)).extend(0.0);
+            camera.world_to_camera = camera.world_to_camera.inverse();
+            let to = Similarity { scale: 2.0, rotation: DQuat::IDENTITY, translation: shift };
+            View { camera: camera.transformed(&to), ..v.clone() }
+        };
+        bowl.iter().enumerate().map(of).collect::<Vec<View>>()
+    };
+    let model = model();
+    for shake in [0.0, 1e-7, 1e-5, 1e-4] {
+        let mut views = inverted(shake, DVec3::ZERO);
+        let refused = |error: Error| {
+            assert!(matches!(&error, Error::Input { field, .. } if field == "cameras") && !error.is_failure());
+            let text = error.to_string();
+            assert!(text.contains("all of them at one place") && text.contains("world-to-camera"), "{text}");
+        };
+        refused(model.run(&views, &short(&model), &mut go).unwrap_err());
+        refused(to_canonical(&views, &FrameConfig::default()).unwrap_err());
+        views.iter_mut().flat_map(|v| v.image.pixels_mut()).for_each(|p| p[3] = 255);
+        refused(freerange::cut_out(&mut views, &Default::default()).unwrap_err());
+    }
+    // An object far from the origin is one all the same.
+    let far = Similarity { scale: 1.0, rotation: DQuat::IDENTITY, translation: DVec3::new(4.5e5, 5.2e6, 300.0) };
+    to_canonical(&elsewhere(&bowl, &far), &FrameConfig::default()).unwrap();
+    // One that is next to nothing is none.
+    let config = FrameConfig { radius: Some(1e-4), ..FrameConfig::default() };
+    let tiny = to_canonical(&bowl, &config).unwrap_err().to_string();
+    assert!(tiny.starts_with("radius: expected an object of a pixel or more"), "{tiny}");
+}
+
+#[test]
+fn what_may_be_wrong_with_views_is_told_before() {
+    let told = |views: Vec<View>| {
+        let loaded = freerange::load_views(views, &Default::default(), &freerange::Stop::default()).unwrap();
+        let notes = freerange::warnings_of(&loaded, &FrameConfig::default(), 6).unwrap();
+        notes.into_iter().map(|n| n.text).collect::<Vec<String>>().join("; ")
+    };
+    let bowl = bowl();
+    let same = scene().warnings(6).unwrap();
+    assert_eq!(told(bowl.clone()), same.iter().map(|n| n.text.as_str()).collect::<Vec<_>>().join("; "));
+    assert!(told(bowl[..3].to_vec()).contains("only 3 photos"));
+    let mut twice = bowl.clone();
+    twice.push(View { camera: bowl[0].camera, name: "again".into(), ..bowl[1].clone() });
+    assert!(told(twice).contains("different photos have the same pose"));
+    let stopped = freerange::Stop::on(std::sync::Arc::new(true.into()), None);
+    assert!(matches!(freerange::load_views(bowl, &Default::default(), &stopped), Err(Error::Cancelled)));
+}
+
 #[test]
 fn threads_may_share_a_model() {
     fn shared<T: Send + Sync>() {}

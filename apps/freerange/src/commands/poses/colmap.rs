@@ -1,14 +1,13 @@
 //! COLMAP's programs. Names of options differ between versions: those that a program's help does not list are left out and told.
 
 use std::{
-    fs::{File, OpenOptions},
     path::Path,
     process::{Command, Stdio},
 };
 
 use super::{
     bounds::Bounds,
-    job::{Done, Job, failed},
+    job::{Done, Job, failed, log_of_engine},
 };
 use crate::error::CliError;
 
@@ -35,9 +34,7 @@ impl Program<'_> {
                 None => self.passed_over.push(format!("{command} {names}")),
             }
         }
-        let log =
-            || OpenOptions::new().create(true).append(true).open(self.log).map_err(|e| CliError::file(self.log, e));
-        run.stdin(Stdio::null()).stdout(log()?).stderr(log()?);
+        run.stdin(Stdio::null()).stdout(log_of_engine(self.log)?).stderr(log_of_engine(self.log)?);
         match self.bounds.run(&mut run, &mut |_| {})?.success() {
             true => Ok(()),
             false => Err(failed(&format!("colmap {command}"), self.log)),
@@ -53,7 +50,6 @@ pub fn run(
     bounds: &Bounds,
     tell: &mut dyn FnMut(&'static str, &str, u64),
 ) -> Result<Done, CliError> {
-    File::create(log).map_err(|e| CliError::file(log, e))?;
     let mut colmap = Program { file, log, bounds, passed_over: Vec::new() };
     let path = |p: &Path| p.to_string_lossy().into_owned();
     let flag = |on: bool| u8::from(on).to_string();

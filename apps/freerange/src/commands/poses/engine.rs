@@ -1,14 +1,13 @@
 //! Programs that find poses: COLMAP's on the PATH, or pycolmap in a Python. Run as processes; their words go to a log.
 
 use std::{
-    fs::File,
     path::{Path, PathBuf},
     process::{Command, Stdio},
 };
 
 use super::{
     bounds::Bounds,
-    job::{Done, Job, failed},
+    job::{Done, Job, failed, log_of_engine},
 };
 use crate::error::CliError;
 
@@ -99,7 +98,7 @@ fn run_pycolmap(
     };
     let script = write("engine.py", SCRIPT.as_bytes())?;
     let asked = write("job.json", &serde_json::to_vec_pretty(job).map_err(CliError::failure)?)?;
-    let errors = File::create(log).map_err(|e| CliError::file(log, e))?;
+    let errors = log_of_engine(log)?;
     let mut command = Command::new(python);
     command.arg(script).arg(asked).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(errors);
     let mut begun = 0;

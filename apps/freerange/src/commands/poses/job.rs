@@ -1,6 +1,10 @@
 //! What an engine is asked for, and what comes of it.
 
-use std::path::{Path, PathBuf};
+use std::{
+    fs::{File, OpenOptions},
+    io::Write,
+    path::{Path, PathBuf},
+};
 
 use serde::{Deserialize, Serialize};
 
@@ -49,10 +53,40 @@ pub struct Done {
     pub reprojection_error: Option<f64>,
 }
 
+/// How a line of the log begins that is not the engine's.
+const OWN: &str = "freerange: ";
+/// Lines of the log in an error.
+const QUOTED: usize = 3;
+
+/// Begins an attempt, the first or a later one, in the log.
+pub fn begin(log: &Path, attempt: usize, what: &str) -> Result<(), CliError> {
+    let file = if attempt == 1 { File::create(log) } else { opened(log) };
+    file.and_then(|mut file| writeln!(file, "{OWN}attempt {attempt}: {what}")).map_err(|e| CliError::file(log, e))
+}
+
+/// The log, for an engine to write on.
+pub fn log_of_engine(log: &Path) -> Result<File, CliError> {
+    opened(log).map_err(|e| CliError::file(log, e))
+}
+
+fn opened(log: &Path) -> std::io::Result<File> {
+    OpenOptions::new().create(true).append(true).open(log)
+}
+
+/// What the engine said last in the attempt that the log ends with.
+pub fn last_words(log: &Path) -> Vec<String> {
+    let text = std::fs::read(log).map(|b| String::from_utf8_lossy(&b).into_owned()).unwrap_or_default();
+    let of_attempt = text.lines().rev().take_while(|line| !line.starts_with(OWN));
+    let mut last: Vec<String> = of_attempt.filter(|l| !l.trim().is_empty()).take(QUOTED).map(str::to_owned).collect();
+    last.reverse();
+    last
+}
+
 /// An engine's failure, with the end of what it said.
 pub fn failed(engine: &str, log: &Path) -> CliError {
-    let text = std::fs::read(log).map(|b| String::from_utf8_lossy(&b).into_owned()).unwrap_or_default();
-    let last: Vec<&str> = text.lines().rev().filter(|l| !l.trim().is_empty()).take(2).collect();
-    let last: Vec<&str> = last.into_iter().rev().collect();
-    CliError::failure(format!("{engine} failed; {} ends with: {}", log.display(), last.join(" / ")))
+    let last = last_words(log);
+    CliError::failure(match last.is_empty() {
+        true => format!("{engine} failed without a message"),
+        false => format!("{engine} failed; its log ends with: {}", last.join(" / ")),
+    })
 }

@@ -9,7 +9,7 @@ mod moving;
 mod search;
 mod taken;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use freerange_scene::read::photos_in;
 use serde::Serialize;
@@ -19,8 +19,15 @@ pub use self::{
     engine::Engine,
     search::{ADVICE, STEPS, Search, Told},
 };
-use self::{job::Done, judge::Judgement, search::Found};
+use self::{
+    job::{Done, last_words},
+    judge::Judgement,
+    search::Found,
+};
 use crate::{error::CliError, output::OutputFolder, progress::Progress};
+
+/// The file in the output folder with what the engine says.
+const LOG: &str = "poses.log";
 
 /// Find the cameras of photos that have none with COLMAP or pycolmap, and check them.
 ///
@@ -65,10 +72,10 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     let engine = Engine::find(args.python.as_deref())?;
     eprintln!("{} photos, {}", files.len(), engine.name());
     let output = OutputFolder::create("poses", &args.output)?;
-    let scene = output.path("poses.log")?;
+    let log = output.path(LOG)?;
     let search = Search {
         engine: &engine,
-        scene: scene.parent().unwrap_or(&scene),
+        scene: log.parent().unwrap_or(&log),
         work: None,
         masks: args.masks.as_deref(),
         uneven: args.uneven,
@@ -86,8 +93,23 @@ pub fn run(args: &Args) -> Result<(), CliError> {
                 eprintln!("note: {text}");
             }
         }
-    })?;
+    });
+    let found = found.map_err(|error| with_log(error, &log, &args.output))?;
     finish(args, &found, output)
+}
+
+/// An error, and what the engine said until then, which is kept in the output folder.
+fn with_log(error: CliError, log: &Path, folder: &Path) -> CliError {
+    let kept = folder.join(LOG);
+    let keep = || std::fs::create_dir_all(folder).and_then(|()| std::fs::copy(log, &kept));
+    if last_words(log).is_empty() || keep().is_err() {
+        return error;
+    }
+    let text = format!("{error}; the whole log is {}", kept.display());
+    match error.exit_code() {
+        2 => CliError::input(text),
+        _ => CliError::failure(text),
+    }
 }
 
 /// Writes what was found, and says it.
@@ -97,9 +119,9 @@ fn finish(args: &Args, found: &Found, mut output: OutputFolder) -> Result<(), Cl
         serde_json::to_string_pretty(&Report { photos: names, engine: done, judgement }).map_err(CliError::failure)?;
     if !judgement.refused.is_empty() {
         // What is refused is no scene.
-        let log = std::fs::read(output.path("poses.log")?).unwrap_or_default();
+        let log = std::fs::read(output.path(LOG)?).unwrap_or_default();
         output = OutputFolder::create("poses", &args.output)?;
-        output.write("poses.log", &log)?;
+        output.write(LOG, &log)?;
     }
     output.write("poses.json", json.as_bytes())?;
     output.commit()?;

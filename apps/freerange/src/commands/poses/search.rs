@@ -2,12 +2,16 @@
 
 use std::path::{Path, PathBuf};
 
-use freerange_scene::read::{Format, cameras, in_order};
+use freerange_scene::{
+    mask_file,
+    read::{Format, cameras, in_order},
+};
 
 use super::{
+    LOG,
     bounds::Bounds,
     engine::Engine,
-    job::{Done, Job},
+    job::{Done, Job, begin},
     judge::Judgement,
     moving::moving,
     taken::{self, Taken, plain_name, taken},
@@ -20,6 +24,11 @@ pub const ADVICE: &str = "take 16 photos or more, 20 to 25 degrees apart, one wa
 const MANY: usize = 16;
 /// Photos on either side that are compared first, as a share of all: those within 60 degrees of one turn.
 const NEIGHBORS: f64 = 1.0 / 6.0;
+
+/// Contrast that features need. On a table weak ones place photos that would be left out; on turntables they make poses
+/// worse. The other value is COLMAP's own.
+const WEAK: f64 = 0.002;
+const CLEAR: f64 = 0.0066;
 
 /// How cameras are looked for.
 pub struct Search<'a> {
@@ -62,10 +71,24 @@ pub struct Found {
 
 /// What differs between attempts.
 struct Way {
+    /// Counted from 1.
+    attempt: usize,
     /// Photos on either side that are compared, as a share of all.
     neighbors: f64,
     /// Whether masks hide what is beside the object from the engine.
     masked: bool,
+}
+
+impl Way {
+    /// What is tried with `photos`, as the log says it.
+    fn words(&self, given: bool, photos: usize) -> String {
+        let masks = match (given, self.masked) {
+            (true, true) => "features inside the masks",
+            (true, false) => "features beside the masks, too",
+            (false, _) => "no masks",
+        };
+        format!("pairs up to {} photos apart, {masks}", reach(photos, self.neighbors))
+    }
 }
 
 impl Search<'_> {
@@ -89,20 +112,20 @@ impl Search<'_> {
             }
             std::fs::copy(photo, to).map_err(|e| CliError::file(photo, e))?;
         }
-        let mut way = Way { neighbors: NEIGHBORS, masked: self.masks.is_some() };
+        let mut way = Way { attempt: 1, neighbors: NEIGHBORS, masked: self.masks.is_some() };
         let (mut done, mut judgement) = self.attempt(&photos, &names, &way, tell)?;
         if way.masked && !judgement.refused.is_empty() {
             // The turntable or table has features, too.
             let why = judgement.refused.join("; ");
             tell(Told::Note(format!("{why}; trying again with features beside the masks")));
-            way.masked = false;
+            (way.attempt, way.masked) = (way.attempt + 1, false);
             (done, judgement) = self.attempt(&photos, &names, &way, tell)?;
         }
         if judgement.in_doubt {
             // Photos that look alike are farther apart than those that follow one another: fewer pairs mix up fewer.
             let why = judgement.refused.join("; ");
             tell(Told::Note(format!("{why}; trying again with fewer neighbors")));
-            way.neighbors *= 0.5;
+            (way.attempt, way.neighbors) = (way.attempt + 1, 0.5 * way.neighbors);
             (done, judgement) = self.attempt(&photos, &names, &way, tell)?;
         }
         if names.len() < MANY {
@@ -137,8 +160,11 @@ impl Search<'_> {
             Some((folder, _)) => Some(folder.clone()),
             None => moving(photos, &work.path().join("moving"))?,
         };
-        let job = Job { masks: hidden, ..self.job(work.path(), photos, names, way.neighbors)? };
-        let log = self.path("poses.log")?;
+        // The photos are of a turntable, or may be.
+        let peak_threshold = if self.masks.is_some() || hidden.is_some() { CLEAR } else { WEAK };
+        let job = Job { masks: hidden, peak_threshold, ..self.job(work.path(), photos, names, way.neighbors)? };
+        let log = self.path(LOG)?;
+        begin(&log, way.attempt, &way.words(self.masks.is_some(), names.len()))?;
         let done = self.engine.run(&job, &log, &self.bounds, &mut |what, pairs, done| {
             tell(Told::Step(what, pairs, done));
         })?;
@@ -187,7 +213,7 @@ impl Search<'_> {
             pairs,
             thorough: names.len() < MANY || neighbors < NEIGHBORS,
             all_pairs: neighbors >= NEIGHBORS,
-            peak_threshold: if self.masks.is_some() { 0.0066 } else { 0.002 },
+            peak_threshold: WEAK,
             masks: None,
             threads: self.bounds.threads(),
             seed: self.seed,
@@ -195,8 +221,8 @@ impl Search<'_> {
     }
 }
 
-/// Masks as COLMAP reads them without surprises: gray, black or white, of the photo's own size, one for each photo; white where there is none.
-/// Their folder, and for how many photos there was one.
+/// Masks, read as `reconstruct` reads them, as COLMAP reads them without surprises: gray, black or white, of the photo's
+/// own size, one for each photo; white where there is none. Their folder, and for how many photos there was one.
 /// (It leaves photos without a mask out, and lays masks of another size on pixel for pixel.)
 fn masks_again(from: &Path, photos: &[Taken], to: &Path) -> Result<(PathBuf, usize), CliError> {
     std::fs::create_dir_all(to).map_err(|e| CliError::file(to, e))?;
@@ -205,18 +231,18 @@ fn masks_again(from: &Path, photos: &[Taken], to: &Path) -> Result<(PathBuf, usi
         let (size, photo) = (photo.size, &photo.path);
         let stem = photo.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let whole = photo.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let names = [format!("{whole}.png"), format!("{stem}.png"), format!("{whole}.mask.png")];
-        let mask = match names.iter().map(|name| from.join(name)).find(|path| path.is_file()) {
+        let names = [(&whole, ""), (&stem, ""), (&whole, ".mask"), (&stem, ".mask"), (&stem, "_mask")];
+        let mut paths = names.iter().map(|(name, end)| from.join(format!("{name}{end}.png")));
+        let mask = match paths.find(|path| path.is_file() && path != photo) {
             None => image::GrayImage::from_pixel(size.0, size.1, image::Luma([255])),
             Some(path) => {
                 found += 1;
-                let mut mask = image::open(&path).map_err(|e| CliError::file(&path, e))?.into_luma8();
-                if mask.dimensions() != size {
-                    let ((w, h), (mw, mh)) = (size, mask.dimensions());
-                    let what = format!("expected {w} x {h} pixels, as its photo has, found {mw} x {mh}");
+                let mut mask = mask_file(&path, size)?;
+                mask.pixels_mut().for_each(|p| p[0] = if p[0] >= 128 { 255 } else { 0 });
+                if mask.pixels().all(|p| p[0] == 0) {
+                    let what = "expected a mask that shows the object, found one that is empty";
                     return Err(CliError::file(&path, what));
                 }
-                mask.pixels_mut().for_each(|p| p[0] = if p[0] >= 128 { 255 } else { 0 });
                 mask
             }
         };
@@ -229,9 +255,14 @@ fn masks_again(from: &Path, photos: &[Taken], to: &Path) -> Result<(PathBuf, usi
     }
 }
 
+/// How far apart, in the order in which they were taken, photos of a pair are.
+fn reach(photos: usize, share: f64) -> usize {
+    ((photos as f64 * share).round() as usize).max(2).min((photos - 1) / 2 + 1)
+}
+
 /// Pairs of photos that are near to one another on one turn around, a line each.
 fn ring(names: &[String], share: f64) -> String {
-    let reach = ((names.len() as f64 * share).round() as usize).max(2).min((names.len() - 1) / 2 + 1);
+    let reach = reach(names.len(), share);
     let mut lines = std::collections::BTreeSet::new();
     for i in 0..names.len() {
         for k in 1..=reach {
@@ -264,9 +295,29 @@ mod tests {
         let read = |name: &str| image::open(out.join(name)).unwrap().into_luma8();
         assert_eq!((read("a_b.png.png")[(0, 0)][0], read("a_b.png.png")[(7, 5)][0]), (0, 255));
         assert!(read("c.png.png").pixels().all(|p| p[0] == 255));
+        // Two values of labels, the photo cut out, white with alpha, and one of twice the size.
+        let pixel: [fn(bool) -> [u8; 4]; 4] = [
+            |there| [u8::from(there), u8::from(there), u8::from(there), 255],
+            |there| if there { [7, 7, 7, 255] } else { [0, 0, 0, 255] },
+            |there| [40, 50, 60, if there { 255 } else { 0 }],
+            |there| [255, 255, 255, if there { 255 } else { 0 }],
+        ];
+        for (kind, pixel) in pixel.into_iter().enumerate() {
+            for size in [1, 2] {
+                let mask = image::RgbaImage::from_fn(8 * size, 6 * size, |x, _| image::Rgba(pixel(x >= 4 * size)));
+                mask.save(at("given/c.png")).unwrap();
+                let (out, _) = masks_again(&at("given"), &photos, &at("kinds")).unwrap();
+                let mask = image::open(out.join("c.png.png")).unwrap().into_luma8();
+                assert_eq!(mask.dimensions(), (8, 6));
+                assert!(mask.enumerate_pixels().all(|(x, _, p)| p[0] == if x < 4 { 0 } else { 255 }), "{kind}");
+            }
+        }
         image::GrayImage::new(4, 6).save(at("given/c.png")).unwrap();
         let error = masks_again(&at("given"), &photos, &at("bad")).unwrap_err().to_string();
         assert!(error.contains("c.png") && error.contains("4 x 6"), "{error}");
+        image::GrayImage::new(8, 6).save(at("given/c.png")).unwrap();
+        let error = masks_again(&at("given"), &photos, &at("bad")).unwrap_err().to_string();
+        assert!(error.contains("c.png") && error.contains("found one that is empty"), "{error}");
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::{borrow::Cow, collections::HashMap};
 
 use crate::{Gaussians, Harmonics, MAX_DEGREE, Splats, channel, coefficients};
 use base64::{Engine, engine::general_purpose::STANDARD};
-use freerange_util::Invalid;
+use freerange_util::{Invalid, Note};
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use serde::Deserialize;
 use serde_json::Value;
@@ -125,18 +125,18 @@ struct Found {
 }
 
 impl Found {
-    fn notes(&self) -> Vec<String> {
+    fn notes(&self) -> Vec<Note> {
         let mut notes = Vec::new();
         if self.skipped > 0 {
-            notes.push(format!("{} primitives that are no Gaussians are left out", self.skipped));
+            notes.push(Note::dropped(format!("{} primitives that are no Gaussians are left out", self.skipped)));
         }
         if self.degree > MAX_DEGREE {
-            notes.push(format!("color that depends on the viewing direction is left out beyond degree {MAX_DEGREE}"));
+            let text = format!("color that depends on the viewing direction is left out beyond degree {MAX_DEGREE}");
+            notes.push(Note::dropped(text));
         }
         if self.linear && self.splats.harmonics.degree() > 0 {
-            notes.push(
-                "colors are linear: turned to sRGB, those that depend on the viewing direction to first order".into(),
-            );
+            let text = "colors are linear: turned to sRGB, those that depend on the viewing direction to first order";
+            notes.push(Note::changed(text));
         }
         notes
     }

@@ -36,7 +36,7 @@ pub mod viewer;
 use std::{fmt, fs::File, io::Read, io::Write, path::Path};
 
 use crate::{RenderMode, SplatError, Splats, encode_splats, parse_ply};
-use freerange_util::{Invalid, IoError, write_atomically};
+use freerange_util::{Invalid, IoError, Note, write_atomically};
 use glam::DVec3;
 
 pub use error::FormatError;
@@ -154,7 +154,7 @@ pub struct Loaded {
     /// The frame that they are in.
     pub frame: Frame,
     /// What was left out or looks odd, one sentence each, for the user.
-    pub notes: Vec<String>,
+    pub notes: Vec<Note>,
 }
 
 /// What a format's reader finds.
@@ -163,7 +163,7 @@ struct Decoded {
     splats: Splats,
     /// The frame of the numbers, where the file or its format says so.
     frame: Option<Frame>,
-    notes: Vec<String>,
+    notes: Vec<Note>,
 }
 
 /// The bytes of a file.
@@ -322,7 +322,8 @@ fn finite(mut decoded: Decoded) -> Result<Decoded, Invalid> {
             return Err(problem("Gaussians", "at least one of finite numbers", format!("{dropped} of others")));
         }
         decoded.splats = decoded.splats.select(&kept);
-        decoded.notes.push(format!("{dropped} Gaussians with numbers that are not finite are left out"));
+        let text = format!("{dropped} Gaussians with numbers that are not finite are left out");
+        decoded.notes.push(Note::dropped(text));
     }
     Ok(decoded)
 }

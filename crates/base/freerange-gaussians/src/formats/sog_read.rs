@@ -3,7 +3,7 @@
 use std::io::{Cursor, Read};
 
 use crate::{Gaussians, Harmonics, MAX_DEGREE, RenderMode, Splats, channel, coefficients};
-use freerange_util::Invalid;
+use freerange_util::{Invalid, Note};
 use image_webp::WebPDecoder;
 use zip::ZipArchive;
 
@@ -92,7 +92,8 @@ pub fn decode(bytes: &[u8], beside: &Beside) -> Result<Decoded, Invalid> {
         Some(FLAT) => RenderMode::Flat,
         Some(other) => {
             let other: String = other.chars().take(60).collect();
-            notes.push(format!("model {other:?} (how to draw the Gaussians) is not known, and left out"));
+            let text = format!("model {other:?} (how to draw the Gaussians) is not known, and left out");
+            notes.push(Note::dropped(text));
             RenderMode::Default
         }
     };

@@ -4,7 +4,7 @@ use std::io::Read;
 
 use crate::{Gaussians, Harmonics, MAX_DEGREE, RenderMode, Splats, channel, coefficients};
 use flate2::bufread::GzDecoder;
-use freerange_util::Invalid;
+use freerange_util::{Invalid, Note};
 use glam::{DMat3, DQuat, DVec3};
 use half::f16;
 use ruzstd::decoding::StreamingDecoder;
@@ -92,26 +92,26 @@ pub fn decode(bytes: &[u8], told: bool) -> Result<Decoded, Invalid> {
     let mut splats = unpack(&parts.header, parts.streams.each_ref().map(|s| &s[..]))?;
     if parts.header.degree > MAX_DEGREE {
         let left = 3 * (coefficients(parts.header.degree) - coefficients(MAX_DEGREE));
-        notes.push(format!(
+        notes.push(Note::dropped(format!(
             "{left} coefficients per Gaussian (color that depends on the viewing direction) are left out: beyond degree \
              {MAX_DEGREE}"
-        ));
+        )));
     }
     if parts.header.flags & ANTIALIASED != 0 {
         splats.mode = RenderMode::Mip;
         if !ours {
-            notes.push("the file is marked as made for antialiased rendering (some writers mark all of theirs)".into());
+            let text = "the file is marked as made for antialiased rendering (some writers mark all of theirs)";
+            notes.push(Note::understood(text));
         }
     }
     let frame = match axes {
         _ if told => None,
         Some(axes) => Some(right_handed(&mut splats, axes)),
         None => {
-            notes.push(
+            notes.push(Note::assumed(
                 "the file does not tell its axes: taken as +y up, as the format is defined; most converters keep those \
-                 of the .ply they read, often -y up: if this is upside down, --frame y-down:z-up turns it"
-                    .into(),
-            );
+                 of the .ply they read, often -y up: if this is upside down, --frame y-down:z-up turns it",
+            ));
             Some(Frame::Y_UP)
         }
     };
@@ -196,7 +196,7 @@ fn streamed(bytes: &[u8]) -> Result<Parts, Invalid> {
 }
 
 /// What takes the file's axes to right, up, back, if the records say so; and what is not heeded.
-fn extensions(bytes: &[u8]) -> Result<(Option<DMat3>, Vec<String>), Invalid> {
+fn extensions(bytes: &[u8]) -> Result<(Option<DMat3>, Vec<Note>), Invalid> {
     let (mut axes, mut notes) = (None, Vec::new());
     let mut cursor = Cursor { left: bytes };
     while !cursor.left.is_empty() && notes.len() < 20 {
@@ -205,8 +205,10 @@ fn extensions(bytes: &[u8]) -> Result<(Option<DMat3>, Vec<String>), Invalid> {
         let record = cursor.take("extension", length as usize)?;
         match kind {
             COORDINATES => axes = Some(axes_of(Cursor { left: record }.u32("extension, coordinate system")?)?),
-            SAFE_ORBIT => notes.push("limits of the viewer's camera (SPZ_ADOBE_safe_orbit_camera) are left out".into()),
-            _ => notes.push(format!("extension {kind:#010x} ({length} bytes) is left out")),
+            SAFE_ORBIT => {
+                notes.push(Note::dropped("limits of the viewer's camera (SPZ_ADOBE_safe_orbit_camera) are left out"));
+            }
+            _ => notes.push(Note::dropped(format!("extension {kind:#010x} ({length} bytes) is left out"))),
         }
     }
     Ok((axes, notes))

@@ -9,7 +9,7 @@ use std::{
 };
 
 use crate::{Gaussians, Harmonics, MAX_DEGREE, Splats, channel, coefficients};
-use freerange_util::Invalid;
+use freerange_util::{Invalid, Note};
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use zip::ZipArchive;
 
@@ -50,7 +50,8 @@ pub fn decode(bytes: &[u8]) -> Result<Decoded, Invalid> {
     if let Some([unit]) = metadata("metersPerUnit").map(|v| &v.numbers[..])
         && *unit != 1.0
     {
-        found.notes.push(format!("a unit of the stage is {unit} meters: numbers are kept as they are"));
+        let text = format!("a unit of the stage is {unit} meters: numbers are kept as they are");
+        found.notes.push(Note::understood(text));
     }
     let Found { mut splats, positions, notes } = found;
     splats.place(&positions);
@@ -76,7 +77,7 @@ fn first_layer(bytes: &[u8]) -> Result<Cow<'static, [u8]>, Invalid> {
 struct Found {
     splats: Splats,
     positions: Vec<DVec3>,
-    notes: Vec<String>,
+    notes: Vec<Note>,
 }
 
 struct Stage {
@@ -155,7 +156,7 @@ impl Stage {
     }
 
     /// Colors, and what depends on the viewing direction.
-    fn radiance(&self, prim: &Prim, count: usize, notes: &mut Vec<String>) -> Result<(Vec<f32>, Harmonics), Invalid> {
+    fn radiance(&self, prim: &Prim, count: usize, notes: &mut Vec<Note>) -> Result<(Vec<f32>, Harmonics), Invalid> {
         let path = &prim.path;
         let Some(values) = self.numbers(prim, COEFFICIENTS, 3)? else {
             let shown = self.numbers(prim, DISPLAY_COLOR, 3)?.filter(|c| c.len() == 3 * count || c.len() == 3);
@@ -163,7 +164,7 @@ impl Stage {
                 let expected = format!("it, or {DISPLAY_COLOR} of {count} values");
                 return Err(problem(format!("{path}, {COEFFICIENTS}"), expected, "neither"));
             };
-            notes.push(format!("{path} has no {COEFFICIENTS}: colors are its {DISPLAY_COLOR}"));
+            notes.push(Note::assumed(format!("{path} has no {COEFFICIENTS}: colors are its {DISPLAY_COLOR}")));
             let colors = shown.iter().cycle().take(3 * count).map(|v| encoded(f64::from(*v)) as f32).collect();
             return Ok((colors, Harmonics::default()));
         };
@@ -179,7 +180,8 @@ impl Stage {
         }
         let kept = degree.min(MAX_DEGREE);
         if degree > kept {
-            notes.push(format!("color that depends on the viewing direction is left out beyond degree {MAX_DEGREE}"));
+            let text = format!("color that depends on the viewing direction is left out beyond degree {MAX_DEGREE}");
+            notes.push(Note::dropped(text));
         }
         let rows = || values.chunks_exact(3 * each);
         let colors = rows().flat_map(|row| row[..3].iter().map(|v| color_of_sh(f64::from(*v)))).collect();

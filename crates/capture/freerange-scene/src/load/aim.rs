@@ -1,10 +1,10 @@
 //! Where pinholes look that wide lenses are seen through: at the object, wherever it stands in the photo.
 
 use super::{
-    LoadConfig, MaskSource,
+    LoadConfig, Loaded, MaskSource,
     mask_image::{coverage, read_mask},
 };
-use crate::camera::{Camera, Lens, nearest_point};
+use crate::camera::{CANONICAL_RADIUS, Camera, FrameConfig, Lens, canonical_from_user, nearest_point};
 use crate::{
     SceneError,
     decode::{decode, has_alpha, size_of},
@@ -28,6 +28,8 @@ const GRID: u32 = 96;
 pub(super) struct Aim {
     center: DVec3,
     radius: Option<f64>,
+    /// Nothing says where the object is: this is where the cameras' axes meet.
+    pub by_axes: bool,
 }
 
 impl Aim {
@@ -36,7 +38,7 @@ impl Aim {
         let photos = || cameras.photos.iter().zip(masks).filter(|(p, _)| !p.further);
         let Some((wide, _)) = photos().find(|(p, _)| p.lens.is_wide()) else { return Ok(None) };
         if let Some(center) = config.hints.center {
-            return Ok(Some(Self { center, radius: config.hints.radius }));
+            return Ok(Some(Self { center, radius: config.hints.radius, by_axes: false }));
         }
         let mut lines = Vec::new();
         let mut angles = Vec::new();
@@ -66,7 +68,27 @@ impl Aim {
             };
         };
         let radius = angles.iter().map(|(o, angle)| o.distance(center) * angle.min(1.2).sin()).reduce(f64::max);
-        Ok(Some(Self { center, radius: config.hints.radius.or(radius) }))
+        Ok(Some(Self { center, radius: config.hints.radius.or(radius), by_axes: radius.is_none() }))
+    }
+
+    /// The sphere about the masks that were found where axes alone said where to look; none where they were seen
+    /// well: whole, and large.
+    pub fn again(self, cameras: &Cameras, loaded: &Loaded) -> Option<Self> {
+        if !self.by_axes {
+            return None;
+        }
+        let back = canonical_from_user(&loaded.views, &FrameConfig::default()).ok()?.canonical_from_user.inverse();
+        let (center, radius) = (back.apply(DVec3::ZERO), CANONICAL_RADIUS * back.scale);
+        let badly_seen = loaded.views.iter().zip(&loaded.photos).any(|(view, i)| {
+            let (c, photo) = (&view.camera, &cameras.photos[*i]);
+            let towards = c.world_to_camera.transform_point3(center);
+            let half = (radius / towards.length()).min(1.0).asin();
+            let shown = (0.5 * f64::from(c.width) / c.fx).min(0.5 * f64::from(c.height) / c.fy).atan();
+            let aimed = !c.world_to_camera.abs_diff_eq(photo.intrinsics.world_to_camera(), 1e-9);
+            photo.lens.is_wide()
+                && (towards.angle_between(DVec3::Z) + half > 0.95 * shown || aimed && half < 0.5 * shown)
+        });
+        badly_seen.then_some(Self { center, radius: Some(radius), by_axes: false })
     }
 
     /// The pinhole at the place of `taken` that sees the object as `lens` shows it there; none where the one that looks along the axis
@@ -117,7 +139,7 @@ fn outline(
 ) -> Result<Option<(DVec3, Option<f64>)>, SceneError> {
     let size = size_of(&photo.image)?;
     let share = match (mask, &config.masks) {
-        (Some(mask), _) => read_mask(mask, size, config.invert_masks)?,
+        (Some(mask), _) => read_mask(mask, size, config.invert_masks)?.share,
         // An opaque photo shows no outline, and is not decoded to hear of that.
         (None, MaskSource::Auto | MaskSource::Alpha) if has_alpha(&photo.image)? => {
             let image = decode(&photo.image)?.image;

@@ -10,7 +10,7 @@ use crate::{
     estimate::{self, Estimate, Hints},
     mask_model::MaskModel,
 };
-use freerange_util::{Invalid, Note};
+use freerange_util::{Invalid, Note, Stop};
 use image::{GrayImage, Rgba, RgbaImage};
 use rayon::prelude::*;
 
@@ -28,11 +28,12 @@ pub(super) fn plain(view: &View) -> Result<Backdrop, SceneError> {
 }
 
 /// Cuts the object out of views that are in memory, as [`load`](super::load) does by default: those with transparency keep it, a plain background is
-/// cut away; where neither is there, poses and colors tell. Returns what was done, for the user to read.
-pub fn cut(views: &mut [View], hints: &Hints) -> Result<Vec<Note>, SceneError> {
+/// cut away; where neither is there, poses and colors tell. Returns what was done, for the user to read. `stop` ends it early.
+pub fn cut(views: &mut [View], hints: &Hints, stop: &Stop) -> Result<Vec<Note>, SceneError> {
     let told: Vec<Told> = views.iter().map(|v| Told { mask: None, alpha: !opaque(&v.image) }).collect();
     let mut notes = Vec::new();
-    cut_all(views, &told, &LoadConfig { hints: *hints, ..LoadConfig::default() }, &mut notes)?;
+    let config = LoadConfig { hints: *hints, stop: stop.clone(), ..LoadConfig::default() };
+    cut_all(views, &told, &config, &mut notes)?;
     Ok(notes)
 }
 

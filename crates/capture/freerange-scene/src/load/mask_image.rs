@@ -8,9 +8,19 @@ use crate::{
 use image::{GrayImage, Luma, Rgba, RgbaImage};
 use std::path::Path;
 
+/// A mask that was read from its file.
+pub(super) struct ReadMask {
+    /// The object's share of each pixel.
+    pub share: GrayImage,
+    /// The one value besides 0, where it is too dark to be taken for brightness.
+    pub label: Option<u8>,
+    /// The file's own size, where that is not the image's.
+    pub resized: Option<(u32, u32)>,
+}
+
 /// A mask file for an image of `size`: the object's share of each pixel. That is brightness; the alpha of an image that has some and is not
 /// white where it is opaque (the photo, cut out); and of an image with no more than one value besides 0, that value.
-pub(super) fn read_mask(path: &Path, size: (u32, u32), invert: bool) -> Result<GrayImage, SceneError> {
+pub(super) fn read_mask(path: &Path, size: (u32, u32), invert: bool) -> Result<ReadMask, SceneError> {
     let Decoded { image, .. } = decode(path)?;
     let found = image.dimensions();
     let (a, b) = (u64::from(found.0) * u64::from(size.1), u64::from(found.1) * u64::from(size.0));
@@ -19,19 +29,22 @@ pub(super) fn read_mask(path: &Path, size: (u32, u32), invert: bool) -> Result<G
     }
     let mut shares = shares(&image);
     // Labels: 0 and 1, for instance.
-    let label = shares.pixels().map(|p| p[0]).max().filter(|v| (1..128).contains(v));
-    if let Some(label) = label
-        && shares.pixels().all(|p| p[0] == 0 || p[0] == label)
-    {
+    let brightest = shares.pixels().map(|p| p[0]).max().filter(|v| (1..128).contains(v));
+    let label = brightest.filter(|label| shares.pixels().all(|p| p[0] == 0 || p[0] == *label));
+    if label.is_some() {
         shares.pixels_mut().for_each(|p| p[0] = if p[0] == 0 { 0 } else { 255 });
     }
     if invert {
         shares.pixels_mut().for_each(|p| p[0] = 255 - p[0]);
     }
-    if found == size {
-        return Ok(shares);
-    }
-    Ok(gray(&resize_area(&colored(&shares), size.0, size.1)))
+    let resized = (found != size).then_some(found);
+    let share = if resized.is_some() { gray(&resize_area(&colored(&shares), size.0, size.1)) } else { shares };
+    Ok(ReadMask { share, label, resized })
+}
+
+/// A mask file for an image of `size`, as [`load`](crate::load()) reads it: the object's share of each pixel.
+pub fn mask_file(path: &Path, size: (u32, u32)) -> Result<GrayImage, SceneError> {
+    Ok(read_mask(path, size, false)?.share)
 }
 
 fn shares(image: &RgbaImage) -> GrayImage {

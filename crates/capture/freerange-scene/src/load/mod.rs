@@ -6,15 +6,17 @@ mod mask_image;
 mod masks;
 mod memory;
 mod picture;
+mod rims;
+mod tell;
 mod whole;
 
 pub use cut::cut;
+pub use mask_image::mask_file;
 pub use whole::{KeepWhole, Whole};
 
 use crate::camera::{
     Lens, Up, View,
     image_ops::{resize_area, shrunk_size},
-    scene::{fills_frame, find_backdrop},
 };
 use crate::{
     SceneError,
@@ -32,14 +34,16 @@ use mask_image::{colored, gray};
 use masks::{MaskFiles, Meaning, mask_files, meaning};
 use picture::{Picture, picture};
 use rayon::prelude::*;
+use rims::Rims;
 use std::{
     borrow::Cow,
     collections::{BTreeSet, HashSet},
     path::{Path, PathBuf},
 };
+use tell::{tell, tell_files};
 
-/// What a rim of nothing leaves of a photo at least.
-const RIM_FILL: f64 = 0.6;
+/// What notes call photos that are not reconstructed from.
+const COMPARED: &str = "photos to compare with";
 
 /// Where masks come from.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -134,21 +138,37 @@ pub struct Loaded {
 /// An image keeps the orientation in which it is stored, as the programs that write cameras read it; only where its camera has the turned
 /// size, or is that of no file, it is turned as its EXIF data says.
 pub fn load(cameras: &Cameras, config: &LoadConfig) -> Result<Loaded, SceneError> {
+    let config = &LoadConfig { hints: cameras.local(config.hints), ..config.clone() };
+    let (loaded, aim) = load_aimed(cameras, config, None)?;
+    let Some(aim) = aim.and_then(|aim| aim.again(cameras, &loaded)) else { return Ok(loaded) };
+    // Once it is known where the object is, wide lenses are seen by pinholes that look there.
+    drop(loaded);
+    let loaded = match load_aimed(cameras, config, Some(aim)) {
+        Err(SceneError::NotCutOut { .. } | SceneError::Mask { .. }) => load_aimed(cameras, config, None),
+        result => result,
+    };
+    Ok(loaded?.0)
+}
+
+/// [`load`] with what pinholes of wide lenses look at, where that is known, and what they looked at.
+fn load_aimed(cameras: &Cameras, config: &LoadConfig, aim: Option<Aim>) -> Result<(Loaded, Option<Aim>), SceneError> {
     let file = cameras.files.first().cloned().unwrap_or_default();
     let (inputs, further): (Vec<usize>, Vec<usize>) =
         (0..cameras.photos.len()).partition(|i| !cameras.photos[*i].further);
     if inputs.len() < 2 {
         return Err(SceneError::TooFew { file, expected: 2, found: inputs.len() });
     }
-    let config = &LoadConfig { hints: cameras.local(config.hints), ..config.clone() };
     let mut notes = Vec::new();
     let masks = mask_files(cameras, config, &mut notes)?;
-    let aim = Aim::of(cameras, &masks.of, config)?;
+    let aim = if aim.is_some() { aim } else { Aim::of(cameras, &masks.of, config)? };
     memory::check_photos(cameras, config)?;
     let mut pictures = pictures_of(cameras, &inputs, &masks, aim.as_ref(), config)?;
-    tell(&pictures, cameras, &inputs, &mut notes);
+    tell(&pictures, cameras, &inputs, aim.as_ref(), &mut notes);
+    let named = |which: &[usize]| which.iter().map(|i| cameras.photos[*i].name.as_str()).collect::<Vec<&str>>();
+    tell_files(&pictures, cameras, &inputs, "photos", &mut notes);
     let usable = look_at_masks(cameras, &mut pictures, &masks, config, &mut notes)?;
-    without_rims(&mut pictures, "photos", config, &mut notes);
+    let mut rims = Rims::default();
+    rims.take_away(&mut pictures, &named(&inputs), "photos", config, &mut notes);
     let mut names = vec![String::new(); cameras.photos.len()];
     for group in [&inputs, &further] {
         for (i, name) in group.iter().zip(short_names(&cameras.photos, group)) {
@@ -174,9 +194,10 @@ pub fn load(cameras: &Cameras, config: &LoadConfig) -> Result<Loaded, SceneError
     if usable {
         compared.iter_mut().for_each(Picture::only_usable);
     }
-    without_rims(&mut compared, "photos to compare with", config, &mut notes);
+    tell_files(&compared, cameras, &further, COMPARED, &mut notes);
+    rims.take_away(&mut compared, &named(&further), COMPARED, config, &mut notes);
     let further = further_views(compared, &further, &names, &mut notes);
-    Ok(Loaded { views, photos: inputs, whole, further, masks: kind, estimate, notes })
+    Ok((Loaded { views, photos: inputs, whole, further, masks: kind, estimate, notes }, aim))
 }
 
 /// Where the object was not found, what was warned of before may be why.
@@ -274,34 +295,6 @@ fn look_at_masks(
     Ok(false)
 }
 
-/// Transparency that is the same in all photos, and only a rim, is what undistorting them left; it is not the object's outline. `what`: what
-/// notes call the photos.
-fn without_rims(pictures: &mut [Picture], what: &str, config: &LoadConfig, notes: &mut Vec<Note>) {
-    if config.masks == MaskSource::Alpha || !pictures.iter().any(|p| p.alpha) {
-        return;
-    }
-    let shown = |p: &Picture| p.image.pixels().map(|p| p[3] >= 128).collect::<Vec<bool>>();
-    let first = shown(&pictures[0]);
-    let size = pictures[0].image.dimensions();
-    let same = |p: &Picture| {
-        p.image.dimensions() == size
-            && p.image.pixels().zip(&first).filter(|(p, s)| (p[3] >= 128) != **s).count() <= first.len() / 500
-    };
-    let all_same = pictures.len() > 1 && pictures.iter().all(same) && fills_frame(&first, size.0, size.1, RIM_FILL);
-    let mut count = 0;
-    for p in pictures.iter_mut().filter(|p| p.alpha) {
-        let (w, h) = p.image.dimensions();
-        // Or what it leaves is the object before a plain backdrop.
-        p.alpha = !(all_same || fills_frame(&shown(p), w, h, RIM_FILL) && find_backdrop(&p.image).is_ok());
-        count += usize::from(!p.alpha);
-    }
-    if count > 0 {
-        notes.push(Note::assumed(format!(
-            "the transparent rim of {count} {what} is what undistorting them left, not the object's outline (--masks alpha if it is)"
-        )));
-    }
-}
-
 /// Views to compare with; those that nothing cuts out are left out.
 fn further_views(pictures: Vec<Picture>, which: &[usize], names: &[String], notes: &mut Vec<Note>) -> Vec<View> {
     let cut: Vec<Result<View, String>> = pictures
@@ -358,36 +351,6 @@ fn short_names(photos: &[Photo], group: &[usize]) -> Vec<String> {
         return names;
     }
     group.iter().map(|i| format!("{i:03}-{}", photos[*i].name.replace(['/', '\\'], "_"))).collect()
-}
-
-fn tell(pictures: &[Picture], cameras: &Cameras, inputs: &[usize], notes: &mut Vec<Note>) {
-    let lenses = inputs.iter().filter(|i| cameras.photos[**i].lens != Lens::Ideal).count();
-    if lenses > 0 {
-        notes.push(Note::changed(format!("lens distortion was removed from {lenses} photos")));
-    }
-    let aimed = pictures.iter().filter(|p| p.aimed).count();
-    if aimed > 0 {
-        notes.push(Note::changed(format!(
-            "{aimed} photos of wide lenses are seen by a pinhole that looks at the object"
-        )));
-    }
-    let turned = pictures.iter().filter(|p| p.turned).count();
-    if turned > 0 {
-        notes.push(Note::changed(format!("{turned} photos were turned as their EXIF data says")));
-    }
-    let converted = pictures.iter().filter(|p| p.converted).count();
-    if converted > 0 {
-        notes.push(Note::changed(format!("the colors of {converted} photos were converted to sRGB")));
-    }
-    if let Some(p) = pictures.iter().find(|p| !p.aimed && p.image.dimensions() != p.size) {
-        let (w, h) = p.image.dimensions();
-        notes.push(Note::changed(format!("photos are used at {w} x {h} pixels and alike, smaller than they are")));
-    }
-    let wide = pictures.iter().filter(|p| p.size.0 > p.size.1).count();
-    let high = pictures.iter().filter(|p| p.size.0 < p.size.1).count();
-    if wide > 0 && high > 0 {
-        notes.push(Note::understood(format!("{wide} photos are wide, {high} are high")));
-    }
 }
 
 /// Writes masks as files, `NAME.png` for each photo with its whole name, as COLMAP has them and [`MaskSource::Files`] reads them: white is

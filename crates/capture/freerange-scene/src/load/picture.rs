@@ -4,7 +4,7 @@ use super::{
     LoadConfig, MaskSource,
     aim::Aim,
     cut::set_alpha,
-    mask_image::{colored, coverage, gray, read_mask},
+    mask_image::{ReadMask, colored, coverage, gray, read_mask},
 };
 use crate::camera::{Camera, Lens, image_ops::resize_area};
 use crate::{
@@ -35,6 +35,14 @@ pub(super) struct Picture {
     pub aimed: bool,
     /// Whether its colors were others than sRGB's.
     pub converted: bool,
+    /// What its color profile is of, where that is not used.
+    pub profile: Option<&'static str>,
+    /// Whether it has an alpha that its mask file stands in for.
+    pub unused_alpha: bool,
+    /// As [`ReadMask::label`].
+    pub mask_label: Option<u8>,
+    /// As [`ReadMask::resized`].
+    pub mask_resized: Option<(u32, u32)>,
 }
 
 impl Picture {
@@ -53,7 +61,7 @@ pub(super) fn picture(
     aim: Option<&Aim>,
     config: &LoadConfig,
 ) -> Result<Picture, SceneError> {
-    let Decoded { mut image, orientation, converted } = decode(&photo.image)?;
+    let Decoded { mut image, orientation, converted, profile } = decode(&photo.image)?;
     let mut turned = false;
     let mut camera = photo.camera(image.dimensions());
     // Cameras were made for the stored pixels, if those fit; but for those of which it is known otherwise.
@@ -68,13 +76,16 @@ pub(super) fn picture(
     let mut camera = camera?;
     let size = image.dimensions();
     let keeps_alpha = matches!(config.masks, MaskSource::Auto | MaskSource::Alpha) && mask.is_none();
-    let clear = if keeps_alpha { image.pixels().filter(|p| p[3] < 255).count() } else { 0 };
-    let alpha = clear as f64 > SPECKS * f64::from(size.0) * f64::from(size.1)
-        || (clear > 0 && config.masks == MaskSource::Alpha);
+    let clear = if keeps_alpha || mask.is_some() { image.pixels().filter(|p| p[3] < 255).count() } else { 0 };
+    let more_than_specks = clear as f64 > SPECKS * f64::from(size.0) * f64::from(size.1);
+    let alpha = keeps_alpha && (more_than_specks || (clear > 0 && config.masks == MaskSource::Alpha));
+    let unused_alpha = !keeps_alpha && more_than_specks;
     if !keeps_alpha {
         image.pixels_mut().for_each(|p| p[3] = 255);
     }
-    let mut mask = mask.map(|path| read_mask(path, size, config.invert_masks)).transpose()?;
+    let read = mask.map(|path| read_mask(path, size, config.invert_masks)).transpose()?;
+    let (mask_label, mask_resized) = read.as_ref().map_or((None, None), |m| (m.label, m.resized));
+    let mut mask = read.map(|ReadMask { share, .. }| share);
     let mask_covers = mask.as_ref().map_or((0.0, 0.0), coverage);
     let look = aim.filter(|_| photo.lens.is_wide()).and_then(|a| a.camera(&photo.lens, &camera, config.max_side));
     let aimed = look.is_some();
@@ -99,5 +110,19 @@ pub(super) fn picture(
         mask = mask.map(|mask| gray(&resize_area(&colored(&mask), w, h)));
         camera = camera.resized(w, h);
     }
-    Ok(Picture { image, camera, mask, mask_covers, alpha, size, turned, aimed, converted })
+    Ok(Picture {
+        image,
+        camera,
+        mask,
+        mask_covers,
+        alpha,
+        size,
+        turned,
+        aimed,
+        converted,
+        profile,
+        unused_alpha,
+        mask_label,
+        mask_resized,
+    })
 }

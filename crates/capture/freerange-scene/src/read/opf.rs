@@ -1,11 +1,13 @@
-//! Pix4D's Open Photogrammetry Format: `project.opf`, which names `calibrated_cameras.json` and `camera_list.json`.
+//! Pix4D's Open Photogrammetry Format: `project.opf`, which names `calibrated_cameras.json`, `camera_list.json` and
+//! `input_cameras.json`.
 //!
 //! Orientations are omega, phi, kappa in degrees, `R_x(omega) R_y(phi) R_z(kappa)` from a camera's axes (right, up, back) to the processing
-//! frame; positions are in that frame, in which results are, before its shift to the ground. Sizes of images are those of the files.
+//! frame; positions are in that frame, in which results are, before its shift to the ground. Only the input cameras say
+//! how large images are. Without them each is taken to be as large as its file.
 
 use super::{Cameras, Format, Photo, Photos, bytes_of, coefficients, pinhole, world_to_camera};
 use crate::camera::Lens;
-use crate::{SceneError, decode::size_of, error::In, read::Intrinsics};
+use crate::{SceneError, error::In, read::Intrinsics};
 use freerange_util::Note;
 use glam::{DMat3, DVec3};
 use serde_json::Value;
@@ -16,6 +18,7 @@ use std::{
 
 const CALIBRATED: &str = "application/opf-calibrated-cameras+json";
 const LIST: &str = "application/opf-camera-list+json";
+const INPUT: &str = "application/opf-input-cameras+json";
 
 /// Whether a file's beginning looks like one of these.
 pub(super) fn is_one(start: &[u8]) -> bool {
@@ -27,6 +30,8 @@ pub(super) fn is_one(start: &[u8]) -> bool {
 pub struct Calibrated {
     /// Its number, by which the list names its file.
     pub id: u64,
+    /// The number of its sensor, whose size the input cameras have.
+    pub sensor: u64,
     /// Focal length in pixels.
     pub focal: f64,
     /// Principal point in pixels.
@@ -97,6 +102,7 @@ pub fn calibrated(file: &Path, bytes: &[u8]) -> Result<Vec<Calibrated>, SceneErr
         let turned = DMat3::from_rotation_x(omega) * DMat3::from_rotation_y(phi) * DMat3::from_rotation_z(kappa);
         cameras.push(Calibrated {
             id: id(file, &place, camera, "id")?,
+            sensor,
             focal,
             principal: numbers(file, sensor_place, internals, "principal_point_px")?,
             lens: Lens::brown([k[0], k[1], k[2], 0.0], p),
@@ -142,6 +148,30 @@ pub fn uris(file: &Path, bytes: &[u8]) -> Result<HashMap<u64, String>, SceneErro
     Ok(uris)
 }
 
+/// Reads `input_cameras.json`: width and height of each sensor's images in pixels, by the sensor's number.
+pub fn sizes(file: &Path, bytes: &[u8]) -> Result<HashMap<u64, (u64, u64)>, SceneError> {
+    let root = json(file, bytes)?;
+    let mut sizes = HashMap::new();
+    for (i, sensor) in list(file, &root, "sensors")?.iter().enumerate() {
+        let (place, name) = (format!("sensor {i}"), "image_size_px");
+        let side = |k: usize| sensor[name][k].as_u64().filter(|side| *side > 0);
+        let (Some(width), Some(height), 2) = (side(0), side(1), sensor[name].as_array().map_or(0, Vec::len)) else {
+            return Err(In(file).field(&place, name, "2 whole numbers above 0", &sensor[name]));
+        };
+        let number = id(file, &place, sensor, "id")?;
+        if sizes.insert(number, (width, height)).is_some() {
+            return Err(In(file).field(&place, "id", "a number of its own", number));
+        }
+    }
+    Ok(sizes)
+}
+
+/// The input cameras that `project.opf` names, where it names some and they are in its folder.
+pub fn input_cameras(file: &Path, bytes: &[u8]) -> Result<Option<PathBuf>, SceneError> {
+    let root = json(file, bytes)?;
+    Ok(resource(file, &root, INPUT).ok().filter(|input| input.is_file()))
+}
+
 /// Reads `project.opf`: its calibrated cameras and its list of cameras, both in its folder.
 pub fn project(file: &Path, bytes: &[u8]) -> Result<[PathBuf; 2], SceneError> {
     let root = json(file, bytes)?;
@@ -162,7 +192,13 @@ fn resource(project: &Path, root: &Value, kind: &str) -> Result<PathBuf, SceneEr
 }
 
 pub(super) fn read(file: &Path, images: Option<&Path>) -> Result<Cameras, SceneError> {
-    let [cameras_file, list_file] = project(file, &bytes_of(file)?)?;
+    let bytes = bytes_of(file)?;
+    let [cameras_file, list_file] = project(file, &bytes)?;
+    let input_file = input_cameras(file, &bytes)?;
+    let sizes = match &input_file {
+        Some(input) => sizes(input, &bytes_of(input)?)?,
+        None => HashMap::new(),
+    };
     let uris = uris(&list_file, &bytes_of(&list_file)?)?;
     let mut found = Photos::beside(file, images);
     let mut photos = Vec::new();
@@ -171,15 +207,20 @@ pub(super) fn read(file: &Path, images: Option<&Path>) -> Result<Cameras, SceneE
         let Some(uri) = uris.get(&camera.id) else {
             return Err(In(&list_file).field("", "cameras", &format!("a file for camera {}", camera.id), "none"));
         };
-        let Some(image) = found.find(&path_of(uri))? else { continue };
-        let (w, h) = size_of(&image)?;
+        let name = path_of(uri);
+        let Some(image) = found.find(&name)? else { continue };
+        let size = match sizes.get(&camera.sensor) {
+            Some(size) => *size,
+            None => found.size_for_camera(&name, &image).map(|(w, h)| (w.into(), h.into()))?,
+        };
         let pose = world_to_camera(&cameras_file, &place, camera.axes, camera.center)?;
-        let pinhole = pinhole(&cameras_file, &place, (w.into(), h.into()), [camera.focal; 2], camera.principal, pose)?;
+        let pinhole = pinhole(&cameras_file, &place, size, [camera.focal; 2], camera.principal, pose)?;
         let (intrinsics, lens) = (Intrinsics::Pixels(pinhole), camera.lens);
-        photos.push(Photo { name: path_of(uri), image, mask: None, intrinsics, lens, further: false });
+        photos.push(Photo { name, image, mask: None, intrinsics, lens, further: false });
     }
     let mut notes =
         vec![Note::understood("results are in the project's processing frame, before its shift to the ground")];
     found.finish(&mut notes)?;
-    Ok(Cameras::new(Format::Opf, photos, vec![file.into(), cameras_file, list_file], notes))
+    let files = [Some(file.to_path_buf()), Some(cameras_file), Some(list_file), input_file];
+    Ok(Cameras::new(Format::Opf, photos, files.into_iter().flatten().collect(), notes))
 }

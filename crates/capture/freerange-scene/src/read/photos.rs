@@ -2,7 +2,7 @@
 
 use super::inside;
 use crate::camera::scene::{ImageFiles, Located};
-use crate::{SceneError, error::In};
+use crate::{SceneError, decode::size_of, error::In};
 use freerange_util::Note;
 use std::path::{Path, PathBuf};
 
@@ -18,12 +18,14 @@ pub(super) struct Photos<'a> {
     found: usize,
     missing: Vec<String>,
     renamed: Vec<String>,
+    sized: Vec<String>,
 }
 
 impl<'a> Photos<'a> {
     /// Images of `file` in the first of `folders` that has them.
     pub fn new(file: &'a Path, folders: Vec<PathBuf>) -> Self {
-        Self { file, folders, files: ImageFiles::default(), found: 0, missing: Vec::new(), renamed: Vec::new() }
+        let (missing, renamed, sized) = (Vec::new(), Vec::new(), Vec::new());
+        Self { file, folders, files: ImageFiles::default(), found: 0, missing, renamed, sized }
     }
 
     /// The folders where programs that write one file beside the photos have them.
@@ -105,6 +107,13 @@ impl<'a> Photos<'a> {
         Ok(None)
     }
 
+    /// The size of an image that stands in for that of its camera, whose file does not say for which its pixels are.
+    pub fn size_for_camera(&mut self, name: &str, image: &Path) -> Result<(u32, u32), SceneError> {
+        let (w, h) = size_of(image)?;
+        self.sized.push(format!("{name}: {w} x {h}"));
+        Ok((w, h))
+    }
+
     /// What there is to say of them; an error where none was found.
     pub fn finish(self, notes: &mut Vec<Note>) -> Result<(), SceneError> {
         if self.found == 0
@@ -129,6 +138,13 @@ impl<'a> Photos<'a> {
                 "{} photos are files of other names: {}",
                 self.renamed.len(),
                 listed(&self.renamed)
+            )));
+        }
+        if let Some(first) = self.sized.first() {
+            notes.push(Note::assumed(format!(
+                "no file says for which size the cameras of {} photos are: they are taken to be for the photos' own \
+                 ({first}), which is wrong for reduced photos",
+                self.sized.len()
             )));
         }
         Ok(())

@@ -5,7 +5,7 @@
 
 use super::{Cameras, Format, Intrinsics, Photo, Photos, bytes_of, entries, has_extension, pinhole, world_to_camera};
 use crate::camera::{Camera, Lens};
-use crate::{SceneError, decode::size_of, error::In};
+use crate::{SceneError, error::In};
 use freerange_util::Note;
 use glam::{DMat3, DVec3};
 use serde_json::{Map, Value};
@@ -19,12 +19,26 @@ pub(super) fn look_for(scene: &Path) -> Option<PathBuf> {
 
 /// The camera of one JSON file; `size`: of its image, where the file does not say it.
 pub fn camera(file: &Path, bytes: &[u8], size: Option<(u32, u32)>) -> Result<Camera, SceneError> {
+    let root = object(file, bytes)?;
+    camera_of(file, &root, size.filter(|_| !has_size(&root)))
+}
+
+fn object(file: &Path, bytes: &[u8]) -> Result<Map<String, Value>, SceneError> {
     let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
-    let root: Value = serde_json::from_slice(bytes).map_err(|e| In(file).malformed("", format!("not JSON: {e}")))?;
-    let Value::Object(root) = root else {
-        return Err(In(file).malformed("", "expected an object"));
-    };
-    let number = |name: &str| finite(file, &root, name);
+    match serde_json::from_slice(bytes).map_err(|e| In(file).malformed("", format!("not JSON: {e}")))? {
+        Value::Object(root) => Ok(root),
+        _ => Err(In(file).malformed("", "expected an object")),
+    }
+}
+
+/// Whether a file says how large its image is.
+fn has_size(root: &Map<String, Value>) -> bool {
+    root.contains_key("width") || root.contains_key("height")
+}
+
+/// The camera of a file; `size`: of its image, none where the file says it.
+fn camera_of(file: &Path, root: &Map<String, Value>, size: Option<(u32, u32)>) -> Result<Camera, SceneError> {
+    let number = |name: &str| finite(file, root, name);
     let side = |name: &str| match number(name)? {
         v if v.fract() == 0.0 && v > 0.0 => Ok(v as u64),
         v => Err(In(file).field("", name, "a whole number of pixels", v)),
@@ -39,7 +53,7 @@ pub fn camera(file: &Path, bytes: &[u8], size: Option<(u32, u32)>) -> Result<Cam
     let rows = [row(2)?, row(0)?, row(1)?];
     let column = |j: usize| DVec3::new(rows[0][j], rows[1][j], rows[2][j]);
     let pose = world_to_camera(file, "", DMat3::from_cols(column(0), -column(1), -column(2)), column(3))?;
-    let size = match size.filter(|_| !root.contains_key("width") && !root.contains_key("height")) {
+    let size = match size {
         Some((width, height)) => (width.into(), height.into()),
         None => (side("width")?, side("height")?),
     };
@@ -66,7 +80,9 @@ pub(super) fn read(folder: &Path, images_in: Option<&Path>) -> Result<Cameras, S
         let bytes = bytes_of(&file)?;
         let name = file.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
         let Some(image) = found.find(&name)? else { continue };
-        let intrinsics = Intrinsics::Pixels(camera(&file, &bytes, Some(size_of(&image)?))?);
+        let root = object(&file, &bytes)?;
+        let size = if has_size(&root) { None } else { Some(found.size_for_camera(&name, &image)?) };
+        let intrinsics = Intrinsics::Pixels(camera_of(&file, &root, size)?);
         photos.push(Photo { name, image, mask: None, intrinsics, lens: Lens::Ideal, further: false });
     }
     let mut notes = vec![Note::understood("Polycam's world is turned to z up: x, y, z are its z, x, y")];

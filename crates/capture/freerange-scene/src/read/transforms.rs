@@ -42,6 +42,7 @@ fn photo(frame: &FrameDescription, further: bool, images: &mut Photos<'_>) -> Re
     let Some(image) = images.find_at(&frame.image)? else { return Ok(None) };
     let size = match frame.size {
         Some(size) => size,
+        None if frame.is_in_pixels() => images.size_for_camera(&frame.name, &image)?,
         None => size_of(&image)?,
     };
     let intrinsics = Intrinsics::Pixels(frame.camera(size)?);

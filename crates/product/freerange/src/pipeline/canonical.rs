@@ -7,11 +7,11 @@
 
 use freerange_gaussians::Gaussians;
 use freerange_optim::{PosedImage, frame_of, initial_fit};
-use freerange_scene::camera::{Camera, Similarity, View, Window, canonical_from_user};
+use freerange_scene::camera::{Camera, Similarity, View, Window};
 use freerange_util::Note;
 
 use super::watch::Watch;
-use crate::{Detect, Error, Options, Stage, choose_views, error::Lift};
+use crate::{Detect, Error, Options, Stage, choose_views, error::Lift, frame};
 
 /// One of the user's photos in the canonical frame, cropped.
 #[derive(Clone, Copy)]
@@ -62,7 +62,7 @@ impl<'v> CanonicalScene<'v> {
         check_views(views)?;
         let config = &options.pipeline;
         watch.report(Stage::Canonicalize, [0, 1], None, None)?;
-        let frame = canonical_from_user(views, &options.frame).lift()?;
+        let frame = frame::place(views, &options.frame)?;
         let place = &frame.canonical_from_user;
         let photos: Vec<Photo<'_>> =
             views.iter().map(|view| Photo::new(view, view.camera.transformed(place))).collect();

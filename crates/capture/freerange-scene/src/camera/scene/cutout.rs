@@ -132,6 +132,26 @@ fn backdrop(image: &RgbaImage, shown: &[bool]) -> Result<Backdrop, String> {
 /// What is shown within a black rim: none where black along the border is no such rim, but a backdrop or the object.
 fn without_black_rim(image: &RgbaImage, shown: &[bool]) -> Option<Vec<bool>> {
     let (w, h) = image.dimensions();
+    let inner = inside_black(image, shown);
+    fills_frame(&inner, w, h, RIM_FILL).then_some(inner)
+}
+
+/// What is shown within the black along the border of an image, where that black is its backdrop.
+pub(crate) fn within_black(image: &RgbaImage) -> Option<Vec<bool>> {
+    let (w, h) = image.dimensions();
+    let frame = if w < 8 || h < 8 { Vec::new() } else { frame_of(w, h) };
+    // Nine tenths are, if it is; a look at the border is cheap.
+    let black = frame.iter().filter(|(x, y)| near(image.get_pixel(*x, *y), [0; 3])).count();
+    if 2 * black <= frame.len() || find_backdrop(image).ok()?.color.iter().any(|c| *c > BACKGROUND_TOLERANCE) {
+        return None;
+    }
+    let shown: Vec<bool> = image.pixels().map(|p| p[3] >= 128).collect();
+    Some(inside_black(image, &shown))
+}
+
+/// What is shown and not joined to the image's border over black.
+fn inside_black(image: &RgbaImage, shown: &[bool]) -> Vec<bool> {
+    let (w, h) = image.dimensions();
     let index = |x: u32, y: u32| y as usize * w as usize + x as usize;
     let black = |x: u32, y: u32| !shown[index(x, y)] || near(image.get_pixel(x, y), [0; 3]);
     let seeds: Vec<(u32, u32)> = frame_of(w, h).into_iter().filter(|&(x, y)| black(x, y)).collect();
@@ -144,8 +164,7 @@ fn without_black_rim(image: &RgbaImage, shown: &[bool]) -> Option<Vec<bool>> {
         );
         !ys.into_iter().any(|y| xs.clone().any(|x| rim[index(x, y)]))
     };
-    let inner: Vec<bool> = (0..h).flat_map(|y| (0..w).map(move |x| (x, y))).map(|(x, y)| within(x, y)).collect();
-    fills_frame(&inner, w, h, RIM_FILL).then_some(inner)
+    (0..h).flat_map(|y| (0..w).map(move |x| (x, y))).map(|(x, y)| within(x, y)).collect()
 }
 
 /// Whether what is shown comes near all four sides of the image, and fills at least this share of it: all but a rim.

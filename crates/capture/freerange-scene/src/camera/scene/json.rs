@@ -103,6 +103,15 @@ impl Description {
                 }
                 None => {}
             }
+            let others: Vec<&str> =
+                frames.iter().map(|f| f.written.as_str()).filter(|name| !train.contains(*name)).collect();
+            if let Some(first) = others.first() {
+                notes.push(format!(
+                    "{}: {} frames that are not in `train_filenames` are only compared with ({first})",
+                    file.display(),
+                    others.len()
+                ));
+            }
         }
         let mut held = listed(root, "test_filenames", &place)?.unwrap_or_default();
         held.extend(listed(root, "val_filenames", &place)?.unwrap_or_default());
@@ -173,6 +182,11 @@ impl FrameDescription {
             return Err(field(&place, "file_path", "a file name", format!("{written:?}")));
         }
         Ok(Self { name, image, mask, size, lens, written, focal, principal, world_to_camera, place })
+    }
+
+    /// Whether some of its intrinsics are in pixels, so that they are those of an image of one size.
+    pub fn is_in_pixels(&self) -> bool {
+        matches!(self.focal, Focal::Pixels(..)) || self.principal.iter().any(Option::is_some)
     }
 
     /// The frame's camera for an image of `size` (width, height): the file's own, or the image's where it has none.

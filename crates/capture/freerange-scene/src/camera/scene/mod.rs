@@ -12,7 +12,7 @@ mod pose;
 mod write;
 
 pub use cutout::{BACKGROUND_TOLERANCE, cut_out, fills_frame};
-pub(crate) use cutout::{Backdrop, find_backdrop};
+pub(crate) use cutout::{Backdrop, find_backdrop, within_black};
 pub use files::image_size;
 pub use json::{Description, FrameDescription};
 pub use locate::{CONVERT, IMAGE_EXTENSIONS, ImageFiles, Located, unreadable_kind};
