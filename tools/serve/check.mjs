@@ -593,7 +593,10 @@ try {
   check("sliders span the object", within > 0.9 * all && within <= all, `${within} of ${all} and three far away`);
   await click("#edit-tidy");
   await until("!document.getElementById('edit-undo').disabled");
-  check("floaters", await evaluate("window.viewers[0].count") === all - loose, `${await evaluate("window.viewers[0].count")} of ${all + 3}, ${loose} of them loose before`);
+  const tidied = await evaluate("window.viewers[0].count"), file = await get(`/jobs/${await evaluate("location.hash.slice(5)")}/samples/0.ply`), start0 = file.indexOf("end_header\n") + 11;
+  const farthest = Math.max(...Array.from({ length: tidied }, (_, k) => file.readFloatLE(start0 + k * row)));
+  // What hangs together is judged by voxels, whose size depends a little on where all Gaussians are.
+  check("floaters", farthest < 4 && Math.abs(tidied - (all - loose)) < 0.01 * all, `${tidied} of ${all + 3}, ${loose} of them loose before, x up to ${farthest}`);
   const left = ended(program);
   program.kill("SIGTERM");
   check("asked to end", await Promise.race([left, wait(20_000).then(() => "still there")]) === 0, "exit code 0");

@@ -23,7 +23,8 @@ fn says_nothing_of(notes: &[Note], words: &str) {
 }
 
 /// As pyopf 1.4.1 writes it for the project in `tests/golden/opf`; of three captures the first.
-const INPUT: &str = r#"{"format": "application/opf-input-cameras+json", "version": "1.0", "captures": [{"cameras": [{"id": 10,
+const INPUT: &str = r#"{"format": "application/opf-input-cameras+json", "version": "1.0", "captures":
+[{"cameras": [{"id": 10,
 "image_orientation": 1, "model_source": "generic", "pixel_range": {"max": 255.0, "min": 0.0}, "pixel_type":
 "uint8", "sensor_id": 7}], "id": 20, "reference_camera_id": 10, "rig_model_source": "not_applicable", "time":
 "2026-01-01T00:00:00"}], "sensors": [{"bands": [{"name": "Red", "weight": 0.3}, {"name": "Green", "weight":

@@ -1,8 +1,8 @@
 //! Rims of nothing that undistorting leaves around photos, told from outlines of the object.
 //!
 //! A rim belongs to a lens: photos of one lens have the same one, turned where a photo is on its side. Outlines differ
-//! from photo to photo, and fill few of them. So what fills most photos is a rim where photos share it; else it is taken
-//! for the outline, with a warning.
+//! from photo to photo, and fill few of them. So what fills most photos is a rim where photos share it; else it is
+//! taken for the outline, with a warning.
 
 use super::{LoadConfig, MaskSource, picture::Picture};
 use crate::camera::scene::{fills_frame, find_backdrop, within_black};
