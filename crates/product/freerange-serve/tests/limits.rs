@@ -105,9 +105,25 @@ fn large_results_on_their_way_take_no_more_memory_than_they_may() {
 #[test]
 fn bodies_that_arrive_slowly_take_no_more_memory_than_they_may() {
     let server = with(Limits { memory: 8 << 20, ..Limits::default() });
-    let ply = encode(&Splats::from(Fake::cloud(1, 1)), Format::Ply, &WriteOptions::default()).unwrap().bytes;
-    let id = posted(&server, &[Part::file("small.ply", ply)]);
-    server.until(&id, &["done"]);
+    let job = |gaussians: usize| {
+        let mut cloud = Fake::cloud(1, 1);
+        let row = *cloud.row(0);
+        (1..gaussians).for_each(|_| cloud.push(&row));
+        let ply = encode(&Splats::from(cloud), Format::Ply, &WriteOptions::default()).unwrap().bytes;
+        let id = posted(&server, &[Part::file("some.ply", ply)]);
+        server.until(&id, &["done"]);
+        id
+    };
+    // A result that needs more than what five of the eight MiB leave, and one that does not.
+    let (id, large) = (job(1), format!("/jobs/{}/samples/0", job(10_000)));
+    assert_eq!(server.get(&large).status, 200);
+    let until = |status: u16, what: &str| {
+        let begin = Instant::now();
+        while server.get(&large).status != status {
+            assert!(begin.elapsed() < Duration::from_secs(30), "{what}");
+            thread::sleep(Duration::from_millis(20));
+        }
+    };
     let paths = [format!("/jobs/{id}/samples/0/kept"), format!("/jobs/{id}/masks/0")];
     for path in &paths {
         // What it is for has to be there before the first byte is read.
@@ -115,20 +131,13 @@ fn bodies_that_arrive_slowly_take_no_more_memory_than_they_may() {
         let mut slow = TcpStream::connect(server.address).unwrap();
         let head = format!("PUT {path} HTTP/1.1\r\nHost: localhost\r\nContent-Length: {}\r\n\r\n1", 5 << 20);
         slow.write_all(head.as_bytes()).unwrap();
-        let begin = Instant::now();
-        while server.get(&format!("/jobs/{id}/samples/0")).status != 200
-            || server.begun(&paths[0], 5 << 20).status != 503
-        {
-            assert!(begin.elapsed() < Duration::from_secs(30), "{path}: a second one is taken");
-            thread::sleep(Duration::from_millis(20));
+        until(503, "its body is not counted");
+        for other in &paths {
+            assert_eq!(server.begun(other, 5 << 20).status, 503, "{other} beside {path}");
         }
-        assert_eq!(server.begun(&paths[1], 5 << 20).status, 503);
+        assert_eq!(server.get(&format!("/jobs/{id}/samples/0")).status, 200);
         drop(slow);
-        let begin = Instant::now();
-        while server.send("PUT", &paths[0], "", b"1").status == 503 {
-            assert!(begin.elapsed() < Duration::from_secs(30), "its memory is never free again");
-            thread::sleep(Duration::from_millis(20));
-        }
+        until(200, "its memory is never free again");
     }
 }
 

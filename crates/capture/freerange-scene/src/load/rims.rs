@@ -29,8 +29,8 @@ impl Around {
     /// How notes call it, and the option that says that it lies around the object.
     fn words(self) -> (&'static str, &'static str) {
         match self {
-            Self::Clear => ("transparent", "--masks alpha"),
-            Self::Black => ("black", "--masks plain"),
+            Self::Clear => ("transparent", " (--masks alpha if it is)"),
+            Self::Black => ("black", " (--masks plain if it is)"),
         }
     }
 }
@@ -115,7 +115,7 @@ impl Rims {
         let named = |list: &[&Candidate]| format!("{} {what} ({})", list.len(), names[list[0].photo]);
         if !rims.is_empty() {
             notes.push(Note::assumed(format!(
-                "the {color} rim of {} is what undistorting them left, not the object's outline ({option} if it is)",
+                "the {color} rim of {} is what undistorting them left, not the object's outline{option}",
                 named(&rims)
             )));
         }
