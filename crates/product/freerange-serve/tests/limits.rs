@@ -129,7 +129,8 @@ fn bodies_that_arrive_slowly_take_no_more_memory_than_they_may() {
         // What it is for has to be there before the first byte is read.
         assert_eq!(server.begun(&path.replace(&id, "0123456789abcdef"), 5 << 20).status, 404, "{path}");
         let mut slow = TcpStream::connect(server.address).unwrap();
-        let head = format!("PUT {path} HTTP/1.1\r\nHost: localhost\r\nContent-Length: {}\r\n\r\n1", 5 << 20);
+        let (host, length) = (server.address, 5 << 20);
+        let head = format!("PUT {path} HTTP/1.1\r\nHost: {host}\r\nContent-Length: {length}\r\n\r\n1");
         slow.write_all(head.as_bytes()).unwrap();
         until(503, "its body is not counted");
         for other in &paths {
