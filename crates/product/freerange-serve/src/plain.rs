@@ -3,11 +3,13 @@
 use std::path::Path;
 
 /// What other crates advise, and what the page says instead.
-const WORDS: [(&str, &str); 25] = [
+const WORDS: [(&str, &str); 27] = [
     ("; --invert-masks if black is the object", "; tick \u{201c}In mask files black is the object\u{201d} if it is"),
     (" (--masks FOLDER if they do)", ""),
     (" (--masks alpha if it is)", " (choose \u{201c}alpha\u{201d} under Masks if it is)"),
     (" (--masks plain if it is)", " (choose \u{201c}plain\u{201d} under Masks if it is)"),
+    ("(--masks estimate if the ", "(choose \u{201c}from cameras and colors\u{201d} under Masks if the "),
+    (" (masks or --center X,Y,Z do)", " (masks do)"),
     ("give them with --masks", "correct them with the brush"),
     (
         "; give masks (--masks FOLDER, white is the object)",
