@@ -13,4 +13,4 @@ list=${1:?list of scenes}
 output=${2:?folder for the results}
 export RAYON_NUM_THREADS=$SLURM_CPUS_PER_TASK
 exec freerange reconstruct --list "$list" -o "$output" "${@:3}" \
-  --share "$((SLURM_ARRAY_TASK_ID - SLURM_ARRAY_TASK_MIN))/$SLURM_ARRAY_TASK_COUNT"
+  --shard "$((SLURM_ARRAY_TASK_ID - SLURM_ARRAY_TASK_MIN))/$SLURM_ARRAY_TASK_COUNT"

@@ -35,6 +35,11 @@ pub struct Photos {
         hide_short_help = true
     )]
     turntable: Option<Turntable>,
+    /// Up axis of the scene: auto, z, y, cameras (tops of the photos), or a direction X,Y,Z.
+    ///
+    /// With auto: +z where the cameras' format defines it, else from the table below the object or the cameras.
+    #[arg(long, default_value = "auto", allow_hyphen_values = true)]
+    up: UpChoice,
     /// Folder of the photos, if they are not beside the cameras.
     #[arg(long, value_name = "FOLDER", hide_short_help = true)]
     images: Option<PathBuf>,
@@ -163,6 +168,7 @@ impl Photos {
         let Self {
             cameras,
             turntable,
+            up,
             images,
             masks,
             mask_model,
@@ -176,6 +182,7 @@ impl Photos {
             ("mask-model".into(), format!("{mask_model:?}, {mask_model_pixels:?}")),
             ("cameras".into(), format!("{:?}", cameras.map(Format::name))),
             ("turntable".into(), format!("{turntable:?}")),
+            ("up".into(), format!("{up:?}")),
             ("images".into(), format!("{images:?}")),
             ("masks".into(), format!("{masks:?}")),
             ("invert-masks".into(), invert_masks.to_string()),
@@ -186,8 +193,8 @@ impl Photos {
     }
 
     /// Reads a scene; `whole`: what is kept of whole photos.
-    pub fn load(&self, cameras: Cameras, up: UpChoice, whole: KeepWhole) -> Result<Scene, CliError> {
-        let up = match up {
+    pub fn load(&self, cameras: Cameras, whole: KeepWhole) -> Result<Scene, CliError> {
+        let up = match self.up {
             UpChoice::Told(up) => Some(up),
             UpChoice::Auto => None,
         };

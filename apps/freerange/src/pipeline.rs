@@ -9,7 +9,6 @@ use freerange::{
 
 use crate::{
     error::CliError,
-    photos::UpChoice,
     runtime::{local, local_or_shipped},
 };
 
@@ -70,11 +69,6 @@ pub struct PipelineArgs {
     /// Device: auto, cpu, cuda, metal, vulkan or webgpu, with a number as in cuda:1.
     #[arg(long, default_value = "auto", help_heading = "Model and device")]
     pub device: DeviceName,
-    /// Up axis of the scene: auto, z, y, cameras (tops of the photos), or a direction X,Y,Z.
-    ///
-    /// With auto: +z where the cameras' format defines it, else from the table below the object or the cameras.
-    #[arg(long, default_value = "auto", allow_hyphen_values = true, help_heading = "Photos and cameras")]
-    pub up: UpChoice,
 }
 
 /// Presets of quality and time.
@@ -202,7 +196,6 @@ impl PipelineArgs {
     pub fn options_of_jobs(&self, model: &Reconstructor, samples: u32) -> Result<Options, CliError> {
         let mut options = model.options_of(&self.choices())?;
         options.seeds = (0..u64::from(samples)).map(|i| self.seed.wrapping_add(i)).collect();
-        options.frame.up = self.up.or_z();
         model.check(&options)?;
         Ok(options)
     }

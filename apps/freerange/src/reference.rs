@@ -312,6 +312,31 @@ fn every_option_that_the_documents_name_exists() {
     assert!(wrong.is_empty(), "options that no command has:\n{}", wrong.join("\n"));
 }
 
+/// Options of the scripts that launch jobs: values come from variables, so that only names can be looked at.
+#[test]
+fn every_option_of_the_launch_scripts_exists() {
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/launch");
+    let (mut wrong, mut count) = (Vec::new(), 0);
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        let text = std::fs::read_to_string(&path).unwrap().replace("\\\n", " ");
+        for line in text.lines().filter(|line| !line.starts_with('#')) {
+            let mut words = line.split_whitespace().skip_while(|word| *word != "freerange").skip(1);
+            let Some(name) = words.next() else { continue };
+            let name = format!("freerange {name}");
+            let Some((_, command)) = all().into_iter().find(|(known, _)| *known == name) else { continue };
+            for option in words.filter_map(|word| word.strip_prefix("--")) {
+                count += 1;
+                if !command.get_arguments().any(|arg| arg.get_long() == Some(option)) {
+                    wrong.push(format!("{}: {name} --{option}", path.display()));
+                }
+            }
+        }
+    }
+    assert!(wrong.is_empty(), "options that no command has:\n{}", wrong.join("\n"));
+    assert!(count > 1, "options were found in the scripts: {count}");
+}
+
 #[test]
 fn lines_of_a_shell_are_understood() {
     assert_eq!(shell_words("a 'b c' \"d\" # e"), ["a", "b c", "d"]);

@@ -337,6 +337,13 @@ fn bad_numbers_on_the_command_line() {
     ] {
         refused(Path::new("no/such/scene"), options, &[field, "no effect", with]);
     }
+    for options in
+        [&["--spz-version", "2", "no.ply", "no.splat"][..], &["--spz-version", "2", "--mesh", "no.ply", "no.glb"]]
+    {
+        let done = freerange(&[&["convert"], options].concat());
+        let message = String::from_utf8_lossy(&done.stderr).into_owned();
+        assert!(done.status.code() == Some(2) && message.contains("--spz-version"), "{options:?}: {message}");
+    }
     let done = freerange(&["train", "tiny", "-o", "no/such/run", "--save-every", "0"]);
     let message = String::from_utf8_lossy(&done.stderr).into_owned();
     assert_eq!(done.status.code(), Some(2), "{message}");

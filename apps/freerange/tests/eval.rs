@@ -274,6 +274,22 @@ fn bad_input_is_refused_with_exit_code_2() {
     refused(&["--scenes", &dir, "-o", &out, "--shard", "2/2"], &["I/N"]);
     refused(&["--scenes", &dir, "-o", &out, "--set", "propose.flow.cfg_scale=-1"], &["cfg_scale"]);
     refused(&["compare", &dir, &dir], &["report.json"]);
+    // Options without effect.
+    let of_other_objects = [
+        (&["--split", "train"][..], "--data"),
+        (&["--first-seed", "1"], "--generated"),
+        (&["--config", "tiny"], "--generated"),
+        (&["--generated-size", "64"], "--generated"),
+    ];
+    for (option, with) in of_other_objects {
+        refused(&[&["--scenes", &dir, "-o", &out], option].concat(), &[with]);
+    }
+    refused(&["--generated", "1", "-o", &out, "--full-file", "a.json"], &["--scenes"]);
+    for option in [["--seed", "1"], ["--up", "y"]] {
+        let white = ["--scenes", &dir, "-o", &out, "--method", "white"];
+        refused(&[&white[..], &option].concat(), &[option[0], "--method model"]);
+    }
+    refused(&["paper-tables", &dir, "--generated", "1"], &["--picture"]);
     // A folder that holds something else is left alone.
     let message = expect(2, &["eval", "--scenes", &dir, "--method", "white", "-o", &dir, "--overwrite"]);
     assert!(message.contains("empty folder"), "{message}");

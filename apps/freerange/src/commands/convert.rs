@@ -29,9 +29,9 @@ pub struct Args {
     /// the output. FROM overrides what a format says; many .spz are y-down.
     #[arg(long, value_name = "FRAME")]
     frame: Option<Frames>,
-    /// Version of .spz to write: 3, 4 (newer readers) or 2 (oldest readers, rotations off by up to 10 degrees).
-    #[arg(long, value_name = "VERSION", default_value = "3")]
-    spz_version: SpzVersion,
+    /// Version of .spz to write: 3, 4 (newer readers) or 2 (oldest readers, rotations off by up to 10 degrees) [default: 3].
+    #[arg(long, value_name = "VERSION")]
+    spz_version: Option<SpzVersion>,
     /// Keep only Gaussians whose centers lie between two corners: X,Y,Z:X,Y,Z, in the written frame.
     #[arg(long, value_name = "CORNER:CORNER", value_parser = parse_box, allow_hyphen_values = true)]
     r#box: Option<(DVec3, DVec3)>,
@@ -96,6 +96,10 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     } else {
         Format::of(output).map_err(|e| CliError::input(format!("{e}; --mesh writes .glb, .ply or .obj")))?;
     }
+    if args.spz_version.is_some() && (args.mesh || Format::of(output).ok() != Some(Format::Spz)) {
+        let text = format!("--spz-version: expected an .spz file to write, found {}", output.display());
+        return Err(CliError::input(text));
+    }
     let (mut splats, frame) = merged(inputs, args.frame.unwrap_or_default())?;
     if let Some((a, b)) = args.r#box {
         splats = kept(&splats, &splats.within_box(a, b), "in the box")?;
@@ -113,7 +117,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     if args.mesh {
         return mesh(args, &splats, output, frame);
     }
-    let notes = write(&splats, output, &WriteOptions { frame, spz_version: args.spz_version })?;
+    let notes = write(&splats, output, &WriteOptions { frame, spz_version: args.spz_version.unwrap_or_default() })?;
     notes.iter().for_each(|note| eprintln!("note: {note}"));
     println!("{} ({} Gaussians)", output.display(), splats.cloud.len());
     Ok(())

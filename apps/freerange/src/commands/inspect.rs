@@ -13,12 +13,7 @@ use freerange_scene::{
     write_masks,
 };
 
-use crate::{
-    error::CliError,
-    output::OutputFolder,
-    photos::{Photos, UpChoice},
-    runtime::local_or_shipped,
-};
+use crate::{error::CliError, output::OutputFolder, photos::Photos, runtime::local_or_shipped};
 
 /// Check a scene before reconstruction: cameras, masks, place and size of the object, and warnings.
 ///
@@ -33,9 +28,6 @@ pub struct Args {
     output: PathBuf,
     #[command(flatten)]
     photos: Photos,
-    /// Up axis of the scene: auto, z, y, cameras (tops of the photos), or a direction X,Y,Z.
-    #[arg(long, default_value = "auto", allow_hyphen_values = true)]
-    up: UpChoice,
     /// Model whose number of network views is used [default: the built-in one].
     #[arg(long, value_name = "FILE", conflicts_with = "views")]
     checkpoint: Option<PathBuf>,
@@ -60,7 +52,7 @@ pub fn run(args: &Args) -> Result<(), CliError> {
     let folder = (cameras.photos.len() > MOST_IN_MEMORY).then(tempfile::tempdir).transpose();
     let folder = folder.map_err(CliError::failure)?;
     let whole = folder.as_ref().map_or(KeepWhole::Memory, |folder| KeepWhole::Folder(folder.path().into()));
-    let scene = args.photos.load(cameras, args.up, whole)?;
+    let scene = args.photos.load(cameras, whole)?;
     let views = match args.views {
         Some(k) => usize::from(k),
         None => {

@@ -181,6 +181,7 @@ struct SceneReport {
     canonical_from_user: freerange::Similarity,
     samples: Vec<SampleReport>,
     seconds: Vec<(&'static str, f64)>,
+    /// Of the process so far: in a batch with the scenes before, whose memory is kept for the next.
     peak_memory_bytes: Option<u64>,
 }
 
@@ -234,7 +235,7 @@ fn run_in(args: &Args, job: &Job) -> Result<(), CliError> {
     // What cannot be done is refused before photos are read and cut out.
     args.pipeline.options(&model, args.samples)?;
     let program = Program::of(&model, args.pipeline.checkpoint_sha256()?);
-    let scene = args.photos.load(args.photos.cameras(path)?, args.pipeline.up, KeepWhole::Small)?;
+    let scene = args.photos.load(args.photos.cameras(path)?, KeepWhole::Small)?;
     let (report, json) =
         reconstruct(args, path, scene, &model, &program, &args.output, begin, || batch::replace(&args.output))?;
     match args.json {

@@ -283,8 +283,8 @@ impl Engine for Local {
     }
 
     fn choose(&self, views: &[View]) -> Result<Vec<usize>, String> {
-        let most = self.model.network_views().map_err(|e| e.to_string())?;
-        choose_views(views, most).map_err(|e| e.to_string())
+        let options = self.model.options_of(&self.pipeline.choices()).map_err(|e| e.to_string())?;
+        choose_views(views, options.pipeline.network_views).map_err(|e| e.to_string())
     }
 
     fn leave_one_out(&self) -> Option<LeaveOneOut> {

@@ -10,7 +10,7 @@ use crate::{
 };
 use freerange_gaussians::Gaussians;
 use freerange_util::Invalid;
-use rand::{SeedableRng, seq::SliceRandom};
+use rand::{Rng, SeedableRng, seq::SliceRandom};
 use rand_chacha::ChaCha8Rng;
 use std::ops::ControlFlow;
 
@@ -71,11 +71,11 @@ pub(crate) fn descend<'t>(
 
         // Within the pool: from outside, each of the many small pieces of a step would wait for a thread to wake.
         let loss = rayon::scope(|_| {
-            // Every other step looks at silhouettes alone, if there are any.
-            let by_silhouette = silhouettes > 0 && step % 2 == 1;
+            // Every other step looks at silhouettes alone, if there are any and as often as they count.
+            let by_silhouette = silhouettes > 0 && step % 2 == 1 && looked_at(targets.weights[targets.views], rng);
             let chosen = match by_silhouette {
                 true => next_views(&mut silhouette_queue, silhouettes, config.views_per_step, rng),
-                false => next_views(&mut queue, targets.views, config.views_per_step, rng),
+                false => next_weighted(&mut queue, &targets.weights[..targets.views], config.views_per_step, rng),
             };
             let background = config.background.draw(rng);
             let windows = (window < 1.0 && !by_silhouette).then(|| targets.windows(&chosen, window, &mut window_rng));
@@ -132,13 +132,48 @@ pub(crate) fn checked(cloud: &Gaussians, most: usize) -> Result<Gaussians, FitEr
 
 /// The next views to look at: all of them once in random order, then again.
 pub(crate) fn next_views(queue: &mut Vec<usize>, count: usize, per_step: usize, rng: &mut ChaCha8Rng) -> Vec<usize> {
+    next_weighted(queue, &vec![1.0; count], per_step, rng)
+}
+
+/// The same, each as often as its weight says. At least one of them has weight 1.
+fn next_weighted(queue: &mut Vec<usize>, weights: &[f64], per_step: usize, rng: &mut ChaCha8Rng) -> Vec<usize> {
     let mut chosen = Vec::new();
-    while chosen.len() < per_step.min(count) {
+    while chosen.len() < per_step.min(weights.len()) {
         if queue.is_empty() {
-            *queue = (0..count).collect();
+            *queue = (0..weights.len()).filter(|&i| looked_at(weights[i], rng)).collect();
             queue.shuffle(rng);
         }
         chosen.extend(queue.pop());
     }
     chosen
+}
+
+/// Whether what has this weight is looked at now. Draws nothing where it always is.
+pub(crate) fn looked_at(weight: f64, rng: &mut ChaCha8Rng) -> bool {
+    weight >= 1.0 || rng.random_bool(weight)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn views_are_looked_at_as_often_as_they_weigh() {
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        let (mut queue, mut times) = (Vec::new(), [0; 4]);
+        for _ in 0..4000 {
+            let chosen = next_weighted(&mut queue, &[1.0, 0.25, 1.0, 0.0], 2, &mut rng);
+            assert_eq!(chosen.len(), 2);
+            chosen.into_iter().for_each(|view| times[view] += 1);
+        }
+        let [full, quarter, other, none] = times;
+        assert!(none == 0 && full == other, "{times:?}");
+        assert!((f64::from(quarter) / f64::from(full) - 0.25).abs() < 0.03, "{times:?}");
+        // Weights of 1 draw nothing: results are those of a program without weights.
+        let mut other = rng.clone();
+        let unweighted = next_views(&mut Vec::new(), 5, 1, &mut rng);
+        assert!(looked_at(1.0, &mut other));
+        assert_eq!(next_weighted(&mut Vec::new(), &[1.0; 5], 1, &mut other), unweighted);
+        assert_eq!(rng, other);
+    }
 }

@@ -3,7 +3,7 @@
 use crate::{
     Evidence, FitError, FitProgress, OptimizationConfig,
     anchors::Anchors,
-    fit::{checked, descend, next_views},
+    fit::{checked, descend, looked_at, next_views},
     mcmc::split,
     objective::Objective,
     views::Targets,
@@ -59,7 +59,9 @@ pub fn optimize<'a>(
     let (mut silhouette_queue, mut step) = (Vec::new(), 0);
     let more = |cloud: &Gaussians, background| {
         step += 1;
-        let by_silhouette = silhouettes.as_ref().filter(|_| step % 2 == 0);
+        let by_silhouette = silhouettes
+            .as_ref()
+            .filter(|targets| step % 2 == 0 && looked_at(targets.weights[targets.views], &mut anchor_rng));
         let by_silhouette =
             by_silhouette.map(|targets| (targets, next_views(&mut silhouette_queue, further, 1, &mut anchor_rng)));
         // The other ones than those of silhouettes.

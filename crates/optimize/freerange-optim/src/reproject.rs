@@ -72,6 +72,7 @@ fn depths(camera: &Camera, raster: &RasterConfig, sets: &[Gaussians]) -> Result<
 struct Photo<'a> {
     camera: Camera,
     image: &'a RgbaImage,
+    weight: f64,
     depth: Vec<(f64, f64)>,
     /// Pixels of the object alone.
     solid: Vec<bool>,
@@ -91,6 +92,7 @@ impl<'a> Photo<'a> {
         Ok(Self {
             camera,
             image,
+            weight: photos.weights[i],
             depth: depths(&camera, &raster, sets)?,
             solid: (0..w * h).into_par_iter().map(solid).collect(),
         })
@@ -159,7 +161,7 @@ impl Points {
     fn look(&mut self, photo: &Photo<'_>) {
         for point in self.0.iter_mut().flatten() {
             if let Some((color, cosine)) = photo.sees(point.place, point.normal) {
-                let weight = cosine.powi(POWER);
+                let weight = photo.weight * cosine.powi(POWER);
                 point.color += weight * color;
                 point.weight += weight;
                 point.cosine = point.cosine.max(cosine);

@@ -30,6 +30,8 @@ pub struct PosedImage<'a> {
     pub image: &'a RgbaImage,
     /// The part of it that counts; none: all of it.
     pub window: Option<Window>,
+    /// How often it is looked at, as a part of how often one of weight 1 is: 0 to 1. Silhouettes have that of their first.
+    pub weight: f64,
 }
 
 impl PosedImage<'_> {
@@ -49,7 +51,7 @@ impl PosedImage<'_> {
 
 impl<'a> From<&'a View> for PosedImage<'a> {
     fn from(view: &'a View) -> Self {
-        Self { name: &view.name, camera: view.camera, image: &view.image, window: None }
+        Self { name: &view.name, camera: view.camera, image: &view.image, window: None, weight: 1.0 }
     }
 }
 
@@ -87,6 +89,8 @@ pub(crate) struct Targets {
     pub images: Vec<Arc<RgbaImage>>,
     /// How many of them are more than silhouettes.
     pub views: usize,
+    /// How often each is looked at ([`PosedImage::weight`]).
+    pub weights: Vec<f64>,
     rasters: Vec<RasterConfig>,
 }
 
@@ -100,6 +104,9 @@ fn check(view: &PosedImage<'_>) -> Result<(), FitError> {
     if (width, height) != (c.width, c.height) {
         let expected = format!("{} x {} pixels, the camera's size", c.width, c.height);
         return refuse(view, "image", expected, format!("{width} x {height}"));
+    }
+    if !(0.0..=1.0).contains(&view.weight) {
+        return refuse(view, "weight", "0 to 1".into(), view.weight.to_string());
     }
     // The rasterizer's own limit.
     if !(1..=16384).contains(&width) || !(1..=16384).contains(&height) {
@@ -160,6 +167,7 @@ impl Targets {
             cameras: cameras.collect(),
             images: of.iter().map(|&of| pictures[of].clone()).collect(),
             views,
+            weights: all.iter().map(|one| one.weight).collect(),
             rasters: of.iter().map(|&of| rasters[of]).collect(),
         })
     }
@@ -171,6 +179,7 @@ impl Targets {
             cameras: kept.iter().map(|&i| self.cameras[i]).collect(),
             images: kept.iter().map(|&i| self.images[i].clone()).collect(),
             views: kept.len(),
+            weights: kept.iter().map(|&i| self.weights[i]).collect(),
             rasters: kept.iter().map(|&i| self.rasters[i]).collect(),
         }
     }
@@ -183,7 +192,13 @@ impl Targets {
 
     /// Windows of the views `chosen`, as views: each about a random point of the object, `part` of the view's width and height.
     pub fn windows(&self, chosen: &[usize], part: f64, rng: &mut impl Rng) -> Self {
-        let mut windows = Self { cameras: Vec::new(), images: Vec::new(), views: chosen.len(), rasters: Vec::new() };
+        let mut windows = Self {
+            cameras: Vec::new(),
+            images: Vec::new(),
+            views: chosen.len(),
+            weights: vec![1.0; chosen.len()],
+            rasters: Vec::new(),
+        };
         for &i in chosen {
             let image = &*self.images[i];
             let (width, height) = image.dimensions();

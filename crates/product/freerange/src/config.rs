@@ -39,11 +39,11 @@ pub struct PipelineConfig {
 pub struct SymmetryConfig {
     /// `auto` looks for a mirror plane and for an axis of revolution, `off` does not.
     pub detect: Detect,
-    /// Greatest [residual](freerange_optim::FoundMirror::doubt) of a mirror plane at which mirrored photos are added to the
-    /// targets. 0: none.
+    /// [Residual](freerange_optim::FoundMirror::doubt) of a mirror plane at which mirrored photos, which are added to the
+    /// targets, have half of their weight: all of it up to 0.05 less, none from 0.05 more. 0: none are added.
     pub reflection_threshold: f64,
-    /// Greatest [residual](freerange_optim::FoundAxis::contradiction) of an axis at which rotated silhouettes are added. 0:
-    /// none.
+    /// [Residual](freerange_optim::FoundAxis::contradiction) of an axis at which rotated silhouettes have half of their
+    /// weight, likewise. 0: none are added.
     pub revolution_threshold: f64,
 }
 

@@ -16,7 +16,7 @@ use super::{
     methods::{Method, MethodName, fit_config},
     sources::{Source, SourceArgs},
 };
-use crate::{error::CliError, pipeline::PipelineArgs, ranks::Job, runtime::commit};
+use crate::{error::CliError, photos::UpChoice, pipeline::PipelineArgs, ranks::Job, runtime::commit};
 
 const FIT_ITERATIONS: usize = 2000;
 const FIT_SIZE: u32 = 128;
@@ -50,6 +50,9 @@ pub struct RunArgs {
     pub fit_size: u32,
     #[command(flatten)]
     pub pipeline: PipelineArgs,
+    /// Up axis of the objects: auto (z), z, y, cameras (tops of the photos), or a direction X,Y,Z.
+    #[arg(long, default_value = "auto", allow_hyphen_values = true, help_heading = "Photos and cameras")]
+    pub up: UpChoice,
     /// Samples per object; reports have their means and their disagreement.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
     pub samples: u32,
@@ -141,6 +144,9 @@ impl RunArgs {
         if !drawn && (self.samples > 1 || self.inputs.len() > 1) {
             return refuse("--method white and ply: expected one sample and one number of inputs, they change nothing");
         }
+        if !drawn && (self.pipeline.seed != 0 || self.up != UpChoice::Auto) {
+            return refuse("--seed and --up go with --method model, start and fit only");
+        }
         let samples = matches!(self.method, MethodName::Model | MethodName::Start);
         if let Some(option) = self.pipeline.given().filter(|_| !samples) {
             return refuse(&format!("{option} goes with --method model and start only"));
@@ -156,6 +162,7 @@ impl RunArgs {
             MethodName::Model | MethodName::Start => {
                 let model = self.pipeline.open(device)?;
                 let mut options = self.pipeline.options(&model, self.samples)?;
+                options.frame.up = self.up.or_z();
                 if self.method == MethodName::Start {
                     let of_network = self.pipeline.set.iter().find(|(key, _)| key.starts_with("refine."));
                     let option = of_network.map(|(key, _)| format!("--set {key}"));
@@ -173,7 +180,7 @@ impl RunArgs {
             MethodName::Fit => {
                 let seeds = (0..u64::from(self.samples)).map(|i| self.pipeline.seed.wrapping_add(i)).collect();
                 let config = Box::new(fit_config(self.fit_iterations, self.fit_size));
-                Method::Fit { config, seeds, up: self.pipeline.up.or_z() }
+                Method::Fit { config, seeds, up: self.up.or_z() }
             }
             MethodName::White => Method::White,
             MethodName::Ply => Method::Ply(self.ply.clone().unwrap_or_default()),

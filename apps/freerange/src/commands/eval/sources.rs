@@ -37,31 +37,31 @@ pub struct SourceArgs {
     #[arg(long, value_name = "N", group = "source")]
     generated: Option<u64>,
     /// File of a scene with the input views from all around.
-    #[arg(long, value_name = "FILE", default_value = "transforms_full.json")]
+    #[arg(long, value_name = "FILE", default_value = "transforms_full.json", requires = "scenes")]
     full_file: String,
     /// File of a scene with the input views from one side.
-    #[arg(long, value_name = "FILE", default_value = "transforms_partial.json")]
+    #[arg(long, value_name = "FILE", default_value = "transforms_partial.json", requires = "scenes")]
     partial_file: String,
     /// File of a scene with the validation views.
-    #[arg(long, value_name = "FILE", default_value = "transforms_val.json")]
+    #[arg(long, value_name = "FILE", default_value = "transforms_val.json", requires = "scenes")]
     validation_file: String,
     /// Folder with the true mesh of each scene, NAME.glb: adds metrics of geometry.
     #[arg(long, value_name = "DIR", requires = "scenes")]
     meshes: Option<PathBuf>,
     /// Split of the shards.
-    #[arg(long, value_enum, default_value = "test")]
+    #[arg(long, value_enum, default_value = "test", requires = "data")]
     split: SplitName,
     /// Seed of the first generated object; the default is beyond the seeds of training data.
-    #[arg(long, default_value_t = 7_000_000_000_000)]
+    #[arg(long, default_value_t = 7_000_000_000_000, requires = "generated")]
     first_seed: u64,
     /// Configuration of generated objects (generator, cameras, views): tiny, base, paper, or a file.
-    #[arg(long, default_value = "tiny")]
+    #[arg(long, default_value = "tiny", requires = "generated")]
     config: PathBuf,
     /// Width and height of the views of generated objects in pixels [default: the configuration's].
-    #[arg(long, value_name = "PIXELS", value_parser = clap::value_parser!(u32).range(16..=2048))]
+    #[arg(long, value_name = "PIXELS", requires = "generated", value_parser = clap::value_parser!(u32).range(16..=2048))]
     generated_size: Option<u32>,
     /// Measure the first N objects only.
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", requires = "source")]
     limit: Option<usize>,
 }
 
@@ -87,6 +87,11 @@ enum Kind {
 }
 
 impl SourceArgs {
+    /// Whether any is named.
+    pub fn given(&self) -> bool {
+        self.scenes.is_some() || self.data.is_some() || self.generated.is_some()
+    }
+
     /// Finds the objects; none is loaded yet.
     pub fn open(&self) -> Result<Source, CliError> {
         let limit = self.limit.unwrap_or(usize::MAX);

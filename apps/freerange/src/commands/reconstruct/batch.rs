@@ -261,7 +261,6 @@ fn options(args: &Args, model: &Reconstructor, checkpoint: String) -> Result<BTr
         ("checkpoint".into(), checkpoint),
         ("seeds".into(), format!("{:?}", own.seeds)),
         ("init".into(), format!("{:?}", args.pipeline.init)),
-        ("up".into(), format!("{:?}", args.pipeline.up)),
         ("holdout".into(), format!("{:?}", (args.holdout_every, &args.holdout))),
         ("format".into(), formats.join(",")),
     ]);
@@ -322,7 +321,7 @@ fn one(
         eprintln!("{}: files have changed since it was made: it is made again", entry.name);
     }
     let folder = args.output.join(&entry.name);
-    let scene = args.photos.load(cameras, args.pipeline.up, KeepWhole::Small)?;
+    let scene = args.photos.load(cameras, KeepWhole::Small)?;
     let (report, _) =
         super::reconstruct(args, &entry.scene, scene, model, program, &folder, begin, || forget(&folder))?;
     let row = row(entry, &report, begin.elapsed().as_secs_f64());

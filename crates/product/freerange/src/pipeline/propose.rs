@@ -24,6 +24,11 @@ use crate::{Error, Init, Options, Reconstructor, Stage, error::Lift, progress::P
 /// Numbers that one seed has for its proposals: as many as `propose.count` allows.
 const MOST: u64 = 64;
 
+/// The seed of a proposal: those of two seeds differ.
+fn number(seed: u64, proposal: usize) -> u64 {
+    seed.wrapping_mul(MOST).wrapping_add(proposal as u64)
+}
+
 /// Makes the proposals of a seed.
 pub(crate) fn propose(
     model: &Reconstructor,
@@ -36,9 +41,9 @@ pub(crate) fn propose(
     let config = &options.pipeline.propose;
     if let Some(init) = &options.init {
         let own = scene.user_proposal(init)?;
-        let fit = fits(scene, targets, options, [seed, 1], watch)?.remove(0);
+        let fit = fits(scene, targets, options, seed, 1, watch)?.remove(0);
         let before = own.len();
-        let all = completed(own, &fit, targets.network_views())?;
+        let all = completed(own, &fit, targets.of_network(0, 1))?;
         let added = all.len() - before;
         if added > 0 && watch.sample == 0 {
             let text = format!("{added} Gaussians of an initial fit are added where the file has none");
@@ -48,15 +53,13 @@ pub(crate) fn propose(
         return Ok(vec![all]);
     }
     match config.init {
-        Init::Fit => fits(scene, targets, options, [seed, config.count as u64], watch),
+        Init::Fit => fits(scene, targets, options, seed, config.count, watch),
         Init::Flow => {
             let flow = &config.flow;
             let sampler = FlowSampler { checkpoint: model.checkpoint(), config: flow, device: &model.device().0 };
-            let views = targets.network_views();
             let sample = |member: usize, progress: &mut refine::OnEstimate<'_>| {
-                // The first is what it is without the others, which draw from far away.
-                let seed = seed.wrapping_add((member as u64) << 32);
-                Ok(sampler.sample(&[views], &[seed], progress).lift()?.remove(0))
+                let views = targets.of_network(member, config.count);
+                Ok(sampler.sample(&[views], &[number(seed, member)], progress).lift()?.remove(0))
             };
             refine::each(model, Stage::Propose, scene, [config.count, flow.steps], &sample, watch)
         }
@@ -68,11 +71,12 @@ fn fits(
     scene: &CanonicalScene<'_>,
     targets: &Targets<'_>,
     options: &Options,
-    [seed, count]: [u64; 2],
+    seed: u64,
+    count: usize,
     watch: &mut Watch<'_>,
 ) -> Result<Vec<Gaussians>, Error> {
     let config = &options.pipeline.propose;
-    let numbers: Vec<u64> = (0..count).map(|i| seed.wrapping_mul(MOST).wrapping_add(i)).collect();
+    let numbers: Vec<u64> = (0..count).map(|i| number(seed, i)).collect();
     // The fit that found the object's place is that of number 0.
     let known = |number: u64| scene.fit.as_ref().filter(|_| number == 0);
     let total = numbers.iter().filter(|n| known(**n).is_none()).count() * config.fit.iterations;

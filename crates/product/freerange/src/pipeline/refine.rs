@@ -37,8 +37,8 @@ pub(crate) fn refine(
         return proposals.iter().map(|cloud| tree_slice(cloud, depth).lift()).collect();
     }
     let refiner = Refiner { checkpoint: model.checkpoint(), config, device: &model.device().0 };
-    let views = targets.network_views();
     let refine = |i: usize, progress: &mut OnEstimate<'_>| {
+        let views = targets.of_network(i, proposals.len());
         Ok(refiner.refine(&[views], std::slice::from_ref(&proposals[i]), progress).lift()?.remove(0))
     };
     each(model, Stage::Refine, scene, [proposals.len(), config.passes], &refine, watch)

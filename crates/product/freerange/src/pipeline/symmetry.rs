@@ -1,9 +1,9 @@
 //! Step 2, symmetry. In: the canonical scene with up to four photos, and an initial fit of it. Out: the targets of the
 //! steps that follow, photos and what a symmetry adds to them: mirrored photos as further views, rotated silhouettes.
 //!
-//! A symmetry is believed where a fit of photos and additions together still agrees with the photos
-//! ([`find_mirror`], [`find_axis`]; docs/research/experiments/symmetry.md). Cost: seven seconds of
-//! two cores.
+//! A symmetry counts as far as a fit of photos and additions together still agrees with the photos
+//! ([`find_mirror`], [`find_axis`]; docs/research/experiments/symmetry.md): its additions have a weight, which falls as the
+//! residual grows. Cost: seven seconds of two cores.
 
 use std::ops::ControlFlow;
 
@@ -23,6 +23,18 @@ use crate::{Detect, Error, PipelineConfig, Stage, error::Lift};
 
 /// Photos beyond which no symmetry is looked for: so many were measured, and the network sees at most twice as many.
 const MOST_PHOTOS: usize = 4;
+/// Residuals within which a weight falls from 1 to 0, the threshold in their middle: rounding moves a residual by less.
+const RAMP: f64 = 0.1;
+
+/// The weight of what a symmetry with this residual adds.
+fn weight(residual: f64, threshold: f64) -> f64 {
+    (0.5 + (threshold - residual) / RAMP).clamp(0.0, 1.0)
+}
+
+/// The residual from which that is 0.
+fn greatest(threshold: f64) -> f64 {
+    threshold + 0.5 * RAMP
+}
 
 /// What one of the searches found.
 enum Found {
@@ -35,11 +47,11 @@ type Tell<'a> = dyn FnMut(usize) -> ControlFlow<()> + 'a;
 /// A search.
 type Job<'a> = Box<dyn FnOnce(&mut Tell<'_>) -> Result<Found, FitError> + Send + 'a>;
 
-/// What was found.
+/// What was found, with weights above 0.
 #[derive(Default)]
 pub(crate) struct Symmetry {
-    mirror: Option<Mirror>,
-    axis: Option<Axis>,
+    mirror: Option<(Mirror, f64)>,
+    axis: Option<(Axis, f64)>,
     notes: Vec<Note>,
 }
 
@@ -51,9 +63,10 @@ pub(crate) struct Targets<'v> {
     network_photos: usize,
     /// All photos.
     photos: Vec<Photo<'v>>,
-    /// Their mirror images.
+    /// Their mirror images, and how much these count.
     mirrored: Vec<View>,
-    axis: Option<Axis>,
+    mirrored_weight: f64,
+    axis: Option<(Axis, f64)>,
 }
 
 /// Looks for symmetries, unless that is switched off or there are more than four photos.
@@ -74,13 +87,15 @@ pub(crate) fn detect(
     // Beside each other: many small pieces of work that follow one another fill each other's gaps.
     let mut jobs: Vec<(usize, Job<'_>)> = Vec::new();
     if limits.revolution_threshold > 0.0 {
-        let find =
-            |tell: &mut Tell<'_>| find_axis(shown, own, fit, limits.revolution_threshold, 0, tell).map(Found::Axis);
+        let find = |tell: &mut Tell<'_>| {
+            find_axis(shown, own, fit, greatest(limits.revolution_threshold), 0, tell).map(Found::Axis)
+        };
         jobs.push((axis_steps(fit), Box::new(find)));
     }
     if limits.reflection_threshold > 0.0 {
-        let find =
-            |tell: &mut Tell<'_>| find_mirror(shown, own, fit, limits.reflection_threshold, 0, tell).map(Found::Mirror);
+        let find = |tell: &mut Tell<'_>| {
+            find_mirror(shown, own, fit, greatest(limits.reflection_threshold), 0, tell).map(Found::Mirror)
+        };
         jobs.push((mirror_steps(fit), Box::new(find)));
     }
     let total = jobs.iter().map(|(steps, _)| steps).sum();
@@ -101,23 +116,26 @@ pub(crate) fn detect(
     }
     watch.report(Stage::Symmetry, [total, total], None, None)?;
     let mut found = Symmetry::default();
-    if let Some(FoundAxis { axis, contradiction }) = axis {
+    let weighted = |residual, threshold| Some(weight(residual, threshold)).filter(|weight| *weight > 0.0);
+    if let Some(FoundAxis { axis, contradiction }) = axis
+        && let Some(weight) = weighted(contradiction, limits.revolution_threshold)
+    {
         let [x, y, z] = axis.direction.to_array();
         found.notes.push(Note::assumed(format!(
             "the object is a solid of revolution about an axis in direction ({x:.2}, {y:.2}, {z:.2}): rotated silhouettes are \
-             further targets (residual {contradiction:.2}, at most {})",
-            limits.revolution_threshold
+             further targets (residual {contradiction:.2}, weight {weight:.2})"
         )));
-        found.axis = Some(axis);
+        found.axis = Some((axis, weight));
     }
-    if let Some(FoundMirror { mirror, doubt }) = mirror {
+    if let Some(FoundMirror { mirror, doubt }) = mirror
+        && let Some(weight) = weighted(doubt, limits.reflection_threshold)
+    {
         let [x, y, z] = mirror.normal.to_array();
         found.notes.push(Note::assumed(format!(
             "the object is symmetric about the plane with normal ({x:.2}, {y:.2}, {z:.2}): mirrored photos are further views \
-             (residual {doubt:.2}, at most {})",
-            limits.reflection_threshold
+             (residual {doubt:.2}, weight {weight:.2})"
         )));
-        found.mirror = Some(mirror);
+        found.mirror = Some((mirror, weight));
     }
     Ok(found)
 }
@@ -129,7 +147,7 @@ impl Symmetry {
         let mut network = scene.network_views();
         let photos = std::mem::take(&mut scene.photos);
         let (network_photos, mut mirror_images) = (network.len(), Vec::new());
-        if let Some(mirror) = &self.mirror {
+        if let Some((mirror, _)) = &self.mirror {
             network.extend(mirrored(&network, mirror));
             let views: Vec<View> = photos.iter().map(Photo::view).collect();
             mirror_images = mirrored(&views, mirror);
@@ -138,19 +156,22 @@ impl Symmetry {
             scene.fit = None;
         }
         scene.notes.extend(self.notes);
-        Targets { network, network_photos, photos, mirrored: mirror_images, axis: self.axis }
+        let mirrored_weight = self.mirror.map_or(0.0, |(_, weight)| weight);
+        Targets { network, network_photos, photos, mirrored: mirror_images, mirrored_weight, axis: self.axis }
     }
 }
 
 impl Targets<'_> {
-    /// What the network sees.
-    pub fn network_views(&self) -> &[View] {
-        &self.network
+    /// What the network sees for proposal `number` of `count`. As large a part of them as the mirrored photos' weight has these.
+    pub fn of_network(&self, number: usize, count: usize) -> &[View] {
+        let with_mirrored = (self.mirrored_weight * count as f64).round() as usize;
+        if number < with_mirrored { &self.network } else { &self.network[..self.network_photos] }
     }
 
     /// What initial fits agree with.
     pub fn of_fits(&self) -> Evidence<'_> {
-        let views: Vec<PosedImage<'_>> = self.network.iter().map(PosedImage::from).collect();
+        let mut views: Vec<PosedImage<'_>> = self.network.iter().map(PosedImage::from).collect();
+        views[self.network_photos..].iter_mut().for_each(|view| view.weight = self.mirrored_weight);
         Evidence { silhouettes: self.silhouettes(&views[..self.network_photos]), views }
     }
 
@@ -163,12 +184,55 @@ impl Targets<'_> {
     pub fn of_optimization(&self) -> Evidence<'_> {
         let mut views: Vec<PosedImage<'_>> = self.photos.iter().map(Photo::posed).collect();
         let silhouettes = self.silhouettes(&views);
-        views.extend(self.mirrored.iter().map(PosedImage::from));
+        let weight = self.mirrored_weight;
+        views.extend(self.mirrored.iter().map(|view| PosedImage { weight, ..view.into() }));
         Evidence { views, silhouettes }
     }
 
     /// Silhouettes of `photos` rotated about the axis, if there is one.
     fn silhouettes<'a>(&self, photos: &[PosedImage<'a>]) -> Vec<PosedImage<'a>> {
-        self.axis.as_ref().map_or_else(Vec::new, |axis| turned(photos, axis))
+        let Some((axis, weight)) = &self.axis else { return Vec::new() };
+        turned(photos, axis).into_iter().map(|view| PosedImage { weight: *weight, ..view }).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_weight_falls_about_the_threshold() {
+        let weights = [0.5, 1.0, 1.025, 1.05, 1.075, 1.1, 2.0].map(|residual| weight(residual, 1.05));
+        let expected = [1.0, 1.0, 0.75, 0.5, 0.25, 0.0, 0.0];
+        assert!(weights.iter().zip(expected).all(|(found, expected)| (found - expected).abs() < 1e-9), "{weights:?}");
+        assert!(weight(greatest(1.05), 1.05).abs() < 1e-9);
+    }
+
+    #[test]
+    fn as_many_proposals_see_mirrored_photos_as_these_weigh() {
+        let view = View {
+            name: "a".into(),
+            camera: freerange_scene::camera::Camera::look_at(
+                glam::DVec3::X,
+                glam::DVec3::ZERO,
+                glam::DVec3::Z,
+                0.9,
+                8,
+                8,
+            ),
+            image: image::RgbaImage::new(8, 8),
+        };
+        for (mirrored_weight, expected) in [(0.0, 0), (0.1, 0), (0.3, 1), (0.5, 2), (0.9, 4), (1.0, 4)] {
+            let targets = Targets {
+                network: vec![view.clone(), view.clone()],
+                network_photos: 1,
+                photos: Vec::new(),
+                mirrored: Vec::new(),
+                mirrored_weight,
+                axis: None,
+            };
+            let seeing = (0..4).filter(|&number| targets.of_network(number, 4).len() == 2).count();
+            assert_eq!(seeing, expected, "weight {mirrored_weight}");
+        }
     }
 }
