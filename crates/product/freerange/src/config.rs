@@ -40,7 +40,7 @@ pub struct SymmetryConfig {
     /// `auto` looks for a mirror plane and for an axis of revolution, `off` does not.
     pub detect: Detect,
     /// [Residual](freerange_optim::FoundMirror::doubt) of a mirror plane at which mirrored photos, which are added to the
-    /// targets, have half of their weight: all of it up to 0.05 less, none from 0.05 more. 0: none are added.
+    /// targets, have half of their weight: all of it up to 0.1 less, none from 0.1 more. 0: none are added.
     pub reflection_threshold: f64,
     /// [Residual](freerange_optim::FoundAxis::contradiction) of an axis at which rotated silhouettes have half of their
     /// weight, likewise. 0: none are added.
@@ -146,7 +146,7 @@ impl PipelineConfig {
         let init = if whole { Init::Fit } else { Init::Flow };
         Ok(Self {
             network_views,
-            symmetry: SymmetryConfig { detect, reflection_threshold: 1.05, revolution_threshold: 0.85 },
+            symmetry: SymmetryConfig { detect, reflection_threshold: 1.1, revolution_threshold: 0.85 },
             propose: ProposeConfig { init, count, fit, flow: sample },
             refine: refiner,
             optimize: OptimizeConfig { iterations, max_resolution },

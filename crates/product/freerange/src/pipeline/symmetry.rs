@@ -23,8 +23,10 @@ use crate::{Detect, Error, PipelineConfig, Stage, error::Lift};
 
 /// Photos beyond which no symmetry is looked for: so many were measured, and the network sees at most twice as many.
 const MOST_PHOTOS: usize = 4;
-/// Residuals within which a weight falls from 1 to 0, the threshold in their middle: rounding moves a residual by less.
-const RAMP: f64 = 0.1;
+/// Residuals within which a weight falls from 1 to 0, the threshold in their middle.
+const RAMP: f64 = 0.2;
+/// The greatest weight of mirrored photos: a photo counts at least twice as much as its mirror image.
+const MIRRORED: f64 = 0.5;
 
 /// The weight of what a symmetry with this residual adds.
 fn weight(residual: f64, threshold: f64) -> f64 {
@@ -130,6 +132,7 @@ pub(crate) fn detect(
     if let Some(FoundMirror { mirror, doubt }) = mirror
         && let Some(weight) = weighted(doubt, limits.reflection_threshold)
     {
+        let weight = MIRRORED * weight;
         let [x, y, z] = mirror.normal.to_array();
         found.notes.push(Note::assumed(format!(
             "the object is symmetric about the plane with normal ({x:.2}, {y:.2}, {z:.2}): mirrored photos are further views \
@@ -202,10 +205,10 @@ mod tests {
 
     #[test]
     fn a_weight_falls_about_the_threshold() {
-        let weights = [0.5, 1.0, 1.025, 1.05, 1.075, 1.1, 2.0].map(|residual| weight(residual, 1.05));
+        let weights = [0.5, 1.0, 1.05, 1.1, 1.15, 1.2, 2.0].map(|residual| weight(residual, 1.1));
         let expected = [1.0, 1.0, 0.75, 0.5, 0.25, 0.0, 0.0];
         assert!(weights.iter().zip(expected).all(|(found, expected)| (found - expected).abs() < 1e-9), "{weights:?}");
-        assert!(weight(greatest(1.05), 1.05).abs() < 1e-9);
+        assert!(weight(greatest(1.1), 1.1).abs() < 1e-9);
     }
 
     #[test]
