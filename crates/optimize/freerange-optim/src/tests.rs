@@ -313,20 +313,6 @@ fn small_anchors() -> AnchorConfig {
 }
 
 #[test]
-fn anchors_weigh_as_much_however_seldom_they_are_looked_at() {
-    let photos = Targets::new(&ring(4, 32, &ball(12, 1)), None).unwrap();
-    let at = |every| Anchors::new(&[ball(12, 1)], &photos, &AnchorConfig { every, ..small_anchors() }).unwrap();
-    let loss = |anchors: &Anchors| anchors.objective(&ball(12, 2), 3, [0.2; 3]).unwrap().loss;
-    for every in [1, 2, 3] {
-        let anchors = at(every);
-        assert_eq!((1..=12).filter(|&step| anchors.due(step)).count() * every, 12);
-        assert!((loss(&anchors) / loss(&at(1)) - every as f64).abs() < 1e-6);
-    }
-    // Silhouettes come at even steps.
-    assert!(at(2).due(1) && !at(2).due(2));
-}
-
-#[test]
 fn anchors_have_the_photos_colors() {
     // A solid ball, gray, of which photos from all around say that it is red.
     let solid = |color: [f32; 3]| {
@@ -383,7 +369,7 @@ fn refining_may_begin_with_small_pictures() {
     let scene = ball(60, 21);
     let (start, views) = (disturbed(&scene, 22), ring(4, 64, &scene));
     let optimized = |coarse, coarse_size, render_size| {
-        let (render_size, anchors) = (Some(render_size), small_anchors());
+        let anchors = small_anchors();
         let config = OptimizationConfig {
             steps: 20,
             gaussians: 90,
@@ -413,15 +399,7 @@ fn clouds_are_optimized_together() {
         let anchors = small_anchors();
         // Too slow to move anything.
         let rates = Rates { mean: 1e-9, scale: 0.0, rotation: 0.0, opacity: 0.0, color: 0.0 };
-        let config = OptimizationConfig {
-            steps: 1,
-            growth_rounds: 0,
-            gaussians,
-            rates,
-            final_mean_rate: 1e-9,
-            anchors,
-            ..Default::default()
-        };
+        let config = OptimizationConfig { steps: 1, gaussians, rates, anchors, ..Default::default() };
         optimize(&start, others, &views, &config, go).unwrap()
     };
     let other = disturbed(&scene, 23);
