@@ -1,7 +1,7 @@
 //! What a fit can be told, with its defaults.
 
 use crate::FitError;
-pub use freerange_util::{Background, Invalid};
+use freerange_util::{Background, Invalid, ensure};
 use serde::{Deserialize, Serialize};
 
 /// Learning rate of each kind of channel, per step of Adam.
@@ -158,44 +158,32 @@ impl Default for AnchorConfig {
     }
 }
 
-/// Refuses with the field's name unless `ok`, which is written so that NaN fails it.
-pub(crate) fn check(
-    field: &'static str,
-    expected: &str,
-    found: impl std::fmt::Display,
-    ok: bool,
-) -> Result<(), FitError> {
-    if ok { Ok(()) } else { Err(Invalid::new(field, expected, found).into()) }
+// All of these are written so that NaN fails them.
+
+fn finite_not_negative(field: &str, v: f64) -> Result<(), Invalid> {
+    ensure(v >= 0.0 && v.is_finite(), field, "a finite number, at least 0", v)
 }
 
-fn finite_not_negative(field: &'static str, v: f64) -> Result<(), FitError> {
-    check(field, "a finite number, at least 0", v, v >= 0.0 && v.is_finite())
+fn positive(field: &str, v: f64) -> Result<(), Invalid> {
+    ensure(v > 0.0 && v.is_finite(), field, "a finite number above 0", v)
 }
 
-fn positive(field: &'static str, v: f64) -> Result<(), FitError> {
-    check(field, "a finite number above 0", v, v > 0.0 && v.is_finite())
+fn fraction(field: &str, v: f64) -> Result<(), Invalid> {
+    ensure((0.0..=1.0).contains(&v), field, "a number from 0 to 1", v)
 }
 
-fn fraction(field: &'static str, v: f64) -> Result<(), FitError> {
-    check(field, "a number from 0 to 1", v, (0.0..=1.0).contains(&v))
-}
-
-fn at_least_one(field: &'static str, v: usize) -> Result<(), FitError> {
-    check(field, "at least 1", v, v >= 1)
+fn at_least_one(field: &str, v: usize) -> Result<(), Invalid> {
+    ensure(v >= 1, field, "at least 1", v)
 }
 
 impl Rates {
-    fn check(&self) -> Result<(), FitError> {
+    fn check(&self) -> Result<(), Invalid> {
         finite_not_negative("rates.mean", self.mean)?;
         finite_not_negative("rates.scale", self.scale)?;
         finite_not_negative("rates.rotation", self.rotation)?;
         finite_not_negative("rates.opacity", self.opacity)?;
         finite_not_negative("rates.color", self.color)
     }
-}
-
-fn check_render_size(size: Option<u32>) -> Result<(), FitError> {
-    check("render_size", "at least 1 pixel", size.unwrap_or(1), size != Some(0))
 }
 
 /// Enough for any use, and few enough that their memory (about 200 bytes each) does not decide.
@@ -206,16 +194,17 @@ impl FitConfig {
     pub fn check(&self) -> Result<(), FitError> {
         at_least_one("iterations", self.iterations)?;
         let most = self.cap_max;
-        check("cap_max", "1 to 16777216", most, (1..=MAX_GAUSSIANS).contains(&most))?;
-        check("initial", "1 to cap_max", self.initial, (1..=most).contains(&self.initial))?;
+        ensure((1..=MAX_GAUSSIANS).contains(&most), "cap_max", "1 to 16777216", most)?;
+        ensure((1..=most).contains(&self.initial), "initial", "1 to cap_max", self.initial)?;
         let strict = |v: f64| v > 0.0 && v < 1.0;
-        check("initial_opacity", "between 0 and 1", self.initial_opacity, strict(self.initial_opacity))?;
-        check("dead_opacity", "between 0 and 1", self.dead_opacity, strict(self.dead_opacity))?;
+        ensure(strict(self.initial_opacity), "initial_opacity", "between 0 and 1", self.initial_opacity)?;
+        ensure(strict(self.dead_opacity), "dead_opacity", "between 0 and 1", self.dead_opacity)?;
         positive("initial_scale", self.initial_scale)?;
         positive("radius", self.radius)?;
         at_least_one("refine_every", self.refine_every)?;
         fraction("growth_stop", self.growth_stop)?;
-        check("growth", "a finite number, at least 1", self.growth, self.growth >= 1.0 && self.growth.is_finite())?;
+        let grows = self.growth >= 1.0 && self.growth.is_finite();
+        ensure(grows, "growth", "a finite number, at least 1", self.growth)?;
         self.rates.check()?;
         positive("rates.mean", self.rates.mean)?;
         positive("final_mean_rate", self.final_mean_rate)?;
@@ -224,7 +213,7 @@ impl FitConfig {
         finite_not_negative("scale_regularizer", self.scale_regularizer)?;
         finite_not_negative("noise_lr", self.noise_lr)?;
         at_least_one("views_per_step", self.views_per_step)?;
-        check_render_size(self.render_size)
+        Ok(ensure(self.render_size != Some(0), "render_size", "at least 1 pixel", 0)?)
     }
 }
 

@@ -3,11 +3,11 @@
 use std::ops::ControlFlow;
 
 use freerange_gaussians::{Alignment, Gaussians, LodTree};
+use freerange_util::ensure;
 use serde::{Deserialize, Serialize};
 
 use crate::{
     Evidence, FitConfig, FitError, FitProgress,
-    config::check,
     fit::{fit, fit_targets},
     views::Targets,
 };
@@ -33,9 +33,9 @@ impl Default for InitialFitConfig {
 impl InitialFitConfig {
     /// Refuses values that no fit can work with.
     pub fn check(&self) -> Result<(), FitError> {
-        check("iterations", "1 to 100000", self.iterations, (1..=100_000).contains(&self.iterations))?;
-        check("gaussians", "1 to 65536", self.gaussians, (1..=65_536).contains(&self.gaussians))?;
-        check("render_size", "8 to 4096 pixels", self.render_size, (8..=4096).contains(&self.render_size))
+        ensure((1..=100_000).contains(&self.iterations), "iterations", "1 to 100000", self.iterations)?;
+        ensure((1..=65_536).contains(&self.gaussians), "gaussians", "1 to 65536", self.gaussians)?;
+        Ok(ensure((8..=4096).contains(&self.render_size), "render_size", "8 to 4096 pixels", self.render_size)?)
     }
 
     fn config(&self, seed: u64) -> FitConfig {
@@ -96,7 +96,6 @@ impl LeaveOneOut {
         if targets.views == 0 {
             return Err(FitError::NoViews);
         }
-        config.check()?;
         fit_targets(&targets, None, &config, progress)
     }
 }
