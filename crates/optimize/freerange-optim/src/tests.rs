@@ -157,6 +157,11 @@ fn parts_of_images_and_all_views_but_one_are_no_copies() {
     assert_eq!(found.rows(), initial_fit(&others, &config, 5, go).unwrap().rows());
 }
 
+/// Photos that searches for symmetries are tested with.
+pub(crate) fn photos(cloud: &Gaussians) -> Vec<View> {
+    cameras(4, 64, 0.3).iter().map(|c| photograph(cloud, c)).collect()
+}
+
 /// What searches for symmetries begin with.
 pub(crate) fn own(views: &[View], config: &InitialFitConfig) -> Gaussians {
     initial_fit(views, config, 0, go).unwrap()
@@ -167,15 +172,8 @@ pub(crate) fn ring(count: usize, size: u32, cloud: &Gaussians) -> Vec<View> {
     cameras(count, size, 0.0).iter().map(|c| photograph(cloud, c)).collect()
 }
 
-/// Mean PSNR in dB of the cloud against views, over white.
 fn psnr(cloud: &Gaussians, views: &[View]) -> f64 {
-    let values = views.iter().map(|v| {
-        let out = render(cloud.rows(), &[v.camera], &[[1.0; 3]], &RasterConfig::default()).unwrap();
-        let shown: Vec<f32> = out.rgb.iter().map(|v| v.clamp(0.0, 1.0)).collect();
-        freerange_raster::metrics::psnr(&shown, &freerange_scene::camera::image_ops::composite(&v.image, [1.0; 3]))
-            .unwrap()
-    });
-    values.sum::<f64>() / views.len() as f64
+    psnr_over_white(cloud, views).unwrap()
 }
 
 pub(crate) fn go(_: &FitProgress<'_>) -> ControlFlow<()> {
@@ -262,7 +260,6 @@ fn continuing_keeps_the_number_and_comes_nearer() {
     assert!(continue_fit(&Gaussians::default(), &views, &config, 3, go).is_err());
 }
 
-/// A cloud as a generator might give it: right on the whole, wrong in detail.
 fn evidence<'a>(views: &'a [View], silhouettes: &'a [View]) -> Evidence<'a> {
     Evidence { silhouettes: silhouettes.iter().map(PosedImage::from).collect(), ..views.into() }
 }
@@ -297,6 +294,7 @@ fn silhouettes_are_fitted_to() {
     assert!(matches!(fit(evidence(&[], &silhouettes), None, &config, go), Err(FitError::NoViews)));
 }
 
+/// A cloud as a generator might give it: right on the whole, wrong in detail.
 fn disturbed(cloud: &Gaussians, seed: u64) -> Gaussians {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut out = cloud.clone();

@@ -1,9 +1,8 @@
 //! How a model is sampled from, and how it refines.
 
 use freerange_model::{Compute, ModelKind};
-use freerange_util::{Invalid, ensure};
+use freerange_util::{Background, Invalid, ensure};
 
-use super::Background;
 use crate::coupling::Coupling;
 
 /// Number of the meaning of settings in records: of a pipeline, a sampler, fits and optimization. Raise it whenever the same
