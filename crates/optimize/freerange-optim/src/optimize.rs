@@ -15,6 +15,7 @@ use std::ops::ControlFlow;
 
 /// Longest side, in pixels, of silhouettes. They come from guesses, which nobody vouches for to the pixel.
 const SILHOUETTES: u32 = 128;
+
 /// Improves a cloud's agreement with posed views, and shows more detail by more Gaussians.
 ///
 /// Few views say little of the rest of the object, and Gaussians that only they judge leave the object's surface. Hence
