@@ -64,8 +64,20 @@ pub fn initial_fit<'a>(
     seed: u64,
     progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Gaussians, FitError> {
+    fit_from(None, seen, config, seed, progress)
+}
+
+/// The same from `start`, where there is one: it keeps its number of Gaussians, whatever `config` says of that.
+pub(crate) fn fit_from<'a>(
+    start: Option<&Gaussians>,
+    seen: impl Into<Evidence<'a>>,
+    config: &InitialFitConfig,
+    seed: u64,
+    progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
+) -> Result<Gaussians, FitError> {
     config.check()?;
-    fit(seen, None, &config.config(seed), progress)
+    let gaussians = start.map_or(config.gaussians, Gaussians::len);
+    fit(seen, start, &InitialFitConfig { gaussians, ..config.clone() }.config(seed), progress)
 }
 
 /// For each of some views an [`initial_fit`] of all the others. They are shrunk once for all of these fits, and not needed any more.
@@ -98,23 +110,6 @@ impl LeaveOneOut {
         }
         fit_targets(&targets, None, &config, progress)
     }
-}
-
-/// `cloud`, moved by as short a fit of what is `seen`: what a sample needs that the views do not look like. It keeps its
-/// number of Gaussians, whatever `config` says of that.
-///
-/// # Errors
-/// Those of [`fit`](crate::fit()).
-pub(crate) fn continue_fit<'a>(
-    cloud: &Gaussians,
-    seen: impl Into<Evidence<'a>>,
-    config: &InitialFitConfig,
-    seed: u64,
-    progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
-) -> Result<Gaussians, FitError> {
-    config.check()?;
-    let own = InitialFitConfig { gaussians: cloud.len(), ..config.clone() };
-    fit(seen, Some(cloud), &own.config(seed), progress)
 }
 
 /// `cloud` as `2^depth` Gaussians in the order of its level-of-detail tree, axes labeled by the world's: as the network

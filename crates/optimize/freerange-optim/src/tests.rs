@@ -1,7 +1,7 @@
 //! Fits of small scenes that the rasterizer itself has drawn, and what all tests share.
 
 use crate::*;
-use crate::{anchors::Anchors, initial::continue_fit, views::Targets};
+use crate::{anchors::Anchors, initial::fit_from, views::Targets};
 use freerange_gaussians::{Gaussians, channel};
 use freerange_raster::{RasterConfig, render};
 use freerange_scene::camera::{Camera, View, Window};
@@ -249,7 +249,7 @@ fn continuing_keeps_the_number_and_comes_nearer() {
     let rough = disturbed(&scene, 9);
     let mut steps = 0;
     let config = InitialFitConfig { iterations: 150, gaussians: 7, render_size: 32 };
-    let continued = continue_fit(&rough, &views, &config, 3, |p| {
+    let continued = fit_from(Some(&rough), &views, &config, 3, |p| {
         steps = p.steps;
         ControlFlow::Continue(())
     })
@@ -257,7 +257,7 @@ fn continuing_keeps_the_number_and_comes_nearer() {
     assert_eq!((steps, continued.len()), (150, 30));
     let [before, after] = [&rough, &continued].map(|cloud| psnr(cloud, &views));
     assert!(after > before + 2.0, "{before} dB, continued {after} dB");
-    assert!(continue_fit(&Gaussians::default(), &views, &config, 3, go).is_err());
+    assert!(fit_from(Some(&Gaussians::default()), &views, &config, 3, go).is_err());
 }
 
 fn evidence<'a>(views: &'a [View], silhouettes: &'a [View]) -> Evidence<'a> {

@@ -91,7 +91,8 @@ pub(crate) struct Targets {
     pub views: usize,
     /// How often each is looked at ([`PosedImage::weight`]).
     pub weights: Vec<f64>,
-    rasters: Vec<RasterConfig>,
+    /// How to render each.
+    pub rasters: Vec<RasterConfig>,
 }
 
 fn refuse<T>(view: &PosedImage<'_>, field: &'static str, expected: String, found: String) -> Result<T, FitError> {
