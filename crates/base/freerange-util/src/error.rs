@@ -38,6 +38,14 @@ pub fn check(ok: bool, field: &str, expected: &str, found: impl Debug) -> Result
     if ok { Ok(()) } else { Err(Invalid::new(field, expected, format!("{found:?}"))) }
 }
 
+/// [`check`], with `found` as it is printed.
+///
+/// # Errors
+/// [`Invalid`].
+pub fn ensure(ok: bool, field: &str, expected: &str, found: impl ToString) -> Result<(), Invalid> {
+    if ok { Ok(()) } else { Err(Invalid::new(field, expected, found)) }
+}
+
 /// A file or folder that cannot be read or written.
 #[derive(Debug, thiserror::Error)]
 #[error("{}: {source}", path.display())]
@@ -136,6 +144,8 @@ mod tests {
         let rate = f64::NAN;
         let refused = check(rate > 0.0, "rates.mean", "above 0", rate).unwrap_err();
         assert_eq!(refused.to_string(), "rates.mean: expected above 0, found NaN");
+        assert_eq!(ensure(false, "a", "b", "c"), Err(Invalid::new("a", "b", "c")));
+        assert_eq!(check(false, "a", "b", "c"), Err(Invalid::new("a", "b", "\"c\"")));
         let path = Path::new("none/there");
         let error = std::fs::read(path).map_err(IoError::at(path)).unwrap_err();
         assert!(error.to_string().starts_with("none/there: "), "{error}");

@@ -14,7 +14,7 @@ mod side_by_side;
 mod stop;
 
 pub use background::Background;
-pub use error::{Invalid, IoError, check, system_failed, with_causes};
+pub use error::{Invalid, IoError, check, ensure, system_failed, with_causes};
 pub use file::{beside, persist, sync_folder, sync_tree, write_atomically};
 pub use hash::{hex, sha256, sha256_of};
 pub use note::{Note, NoteKind};

@@ -13,7 +13,6 @@ mod refiner;
 
 use burn::tensor::Tensor;
 use freerange_gaussians::{Gaussians, channel};
-pub use freerange_util::Background;
 
 pub use self::{
     conditioned::scale_gradient,

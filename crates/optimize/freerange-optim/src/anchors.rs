@@ -8,13 +8,15 @@ use crate::{
 };
 use freerange_gaussians::Gaussians;
 use freerange_raster::{RasterConfig, render, render_backward};
-use freerange_scene::camera::Camera;
+use freerange_scene::camera::{CANONICAL_RADIUS, Camera};
 use glam::DVec3;
 
 /// Distance of the cameras from the origin, in radii of the sphere that holds the object: training cameras' own.
 const DISTANCE: f64 = 3.5;
 /// Part of the image's width that the sphere fills.
 const FILLED: f64 = 0.9;
+/// One of them is looked at every so many steps, with as many times the weight.
+const EVERY: usize = 2;
 /// Highest and lowest cameras, as sines of the elevation.
 const HIGHEST: f64 = 0.9;
 /// Pictures are compared as small ones that stand for images of so many pixels a side.
@@ -29,7 +31,6 @@ pub(crate) struct Anchors {
     pictures: Vec<Picture>,
     raster: RasterConfig,
     weight: f64,
-    every: usize,
 }
 
 struct Picture {
@@ -40,13 +41,13 @@ struct Picture {
 }
 
 /// Cameras spread evenly over the sphere but for its poles (a Fibonacci spiral), looking at the origin.
-fn around(views: usize, size: u32, radius: f64) -> impl Iterator<Item = Camera> {
+fn around(views: usize, size: u32) -> impl Iterator<Item = Camera> {
     let golden = std::f64::consts::PI * (3.0 - 5f64.sqrt());
     let fov = 2.0 * ((1.0 / DISTANCE).asin().tan() / FILLED).atan();
     (0..views).map(move |i| {
         let z = HIGHEST * (1.0 - (2 * i + 1) as f64 / views as f64);
         let (r, angle) = ((1.0 - z * z).sqrt(), golden * i as f64);
-        let eye = DISTANCE * radius * DVec3::new(r * angle.cos(), r * angle.sin(), z);
+        let eye = DISTANCE * CANONICAL_RADIUS * DVec3::new(r * angle.cos(), r * angle.sin(), z);
         Camera::look_at(eye, DVec3::ZERO, DVec3::Z, fov, size, size)
     })
 }
@@ -56,7 +57,7 @@ impl Anchors {
     pub fn new(clouds: &[Gaussians], photos: &Targets, config: &AnchorConfig) -> Result<Self, FitError> {
         let raster = RasterConfig::default().shrunk(config.size as f32 / FULL_SIZE);
         let wanted = if config.weight > 0.0 { usize::MAX } else { 0 };
-        let cameras: Vec<Camera> = around(config.views, config.size, config.radius).take(wanted).collect();
+        let cameras: Vec<Camera> = around(config.views, config.size).take(wanted).collect();
         let shown = reprojected(&cameras, &raster, clouds, photos)?;
         let share = 1.0 / clouds.len() as f32;
         let picture = |(camera, shown): (Camera, Reprojected)| {
@@ -74,13 +75,12 @@ impl Anchors {
             Ok(Picture { camera, rgb, alpha })
         };
         let pictures = cameras.into_iter().zip(shown).map(picture).collect::<Result<_, FitError>>()?;
-        let (weight, every) = (config.weight * config.every as f64, config.every);
-        Ok(Self { pictures, raster, weight, every })
+        Ok(Self { pictures, raster, weight: config.weight * EVERY as f64 })
     }
 
     /// Whether step number `step` looks at one of them.
-    pub fn due(&self, step: usize) -> bool {
-        step % self.every == 1 % self.every
+    pub fn due(step: usize) -> bool {
+        step % EVERY == 1
     }
 
     /// Number of pictures.

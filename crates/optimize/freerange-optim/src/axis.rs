@@ -150,7 +150,7 @@ pub fn turned<'a>(views: &[PosedImage<'a>], axis: &Axis) -> Vec<PosedImage<'a>> 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::tests::{cameras, own, photograph};
+    use crate::tests::{cameras, own, photograph, photos};
     use freerange_gaussians::channel;
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
@@ -178,10 +178,6 @@ mod tests {
             }
         }
         cloud
-    }
-
-    fn photos(cloud: &Gaussians) -> Vec<View> {
-        cameras(4, 64, 0.3).iter().map(|c| photograph(cloud, c)).collect()
     }
 
     const QUICK: InitialFitConfig = InitialFitConfig { iterations: 120, gaussians: 150, render_size: 64 };

@@ -1,7 +1,7 @@
 //! What a fit can be told, with its defaults.
 
 use crate::FitError;
-pub use freerange_util::{Background, Invalid};
+use freerange_util::{Background, Invalid, ensure};
 use serde::{Deserialize, Serialize};
 
 /// Learning rate of each kind of channel, per step of Adam.
@@ -102,25 +102,16 @@ impl Default for FitConfig {
 
 /// Settings of [`optimize`](crate::optimize). The defaults suit objects in the canonical frame (a sphere of radius 0.5 about
 /// the origin).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct OptimizationConfig {
-    /// Optimization steps; each one looks at one view, and every so many at an anchor render.
+    /// Optimization steps; each one looks at one view, and every other one at an anchor render.
     pub steps: usize,
     /// Number of Gaussians at the end; a cloud that has more keeps its number.
     pub gaussians: usize,
-    /// Rounds of relocation and growth, spread evenly over the steps up to the last sixth.
-    pub growth_rounds: usize,
     /// Learning rates at the start.
     pub rates: Rates,
-    /// Learning rate of the centers at the end, reached exponentially. The others are constant.
-    pub final_mean_rate: f64,
-    /// Weight of 1 - SSIM; that of L1 is the rest. 0..1
-    pub lambda_ssim: f64,
-    /// What the Gaussians are rendered in front of.
-    pub background: Background,
-    /// Longest side, in pixels, at which views are compared; larger ones are shrunk. None: as they are.
-    pub render_size: Option<u32>,
+    /// Longest side, in pixels, at which views are compared; larger ones are shrunk.
+    pub render_size: u32,
     /// Part of the steps, the first ones, that compare views at [`coarse_size`](Self::coarse_size): what they see is coarse as yet. 0..1
     pub coarse: f64,
     /// Longest side in pixels at which these steps compare views. Smaller views are compared as they are.
@@ -138,12 +129,8 @@ impl Default for OptimizationConfig {
         Self {
             steps: 500,
             gaussians: 8192,
-            growth_rounds: 16,
             rates: Rates { mean: 1.5e-3, scale: 5e-3, ..FitConfig::default().rates },
-            final_mean_rate: 1.5e-5,
-            lambda_ssim: 0.2,
-            background: Background::Random,
-            render_size: Some(256),
+            render_size: 256,
             coarse: 0.0,
             coarse_size: 256,
             window: 1.0,
@@ -155,8 +142,7 @@ impl Default for OptimizationConfig {
 
 /// Pictures of the cloud before an optimization, taken from all around it: further views that the optimized one has to agree
 /// with.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AnchorConfig {
     /// Weight of the mean absolute difference from a picture, beside a loss of weight 1 on a view. 0: no anchors.
     pub weight: f64,
@@ -164,56 +150,40 @@ pub struct AnchorConfig {
     pub views: usize,
     /// Their width and height in pixels.
     pub size: u32,
-    /// Every so many steps one of them is looked at, with as many times the weight.
-    pub every: usize,
-    /// Radius of the sphere around the origin that they show. World units.
-    pub radius: f64,
 }
 
 impl Default for AnchorConfig {
     fn default() -> Self {
-        Self { weight: 0.1, views: 12, size: 96, every: 2, radius: 0.5 }
+        Self { weight: 0.1, views: 12, size: 96 }
     }
 }
 
-/// Refuses with the field's name unless `ok`, which is written so that NaN fails it.
-pub(crate) fn check(
-    field: &'static str,
-    expected: &str,
-    found: impl std::fmt::Display,
-    ok: bool,
-) -> Result<(), FitError> {
-    if ok { Ok(()) } else { Err(Invalid::new(field, expected, found).into()) }
+// All of these are written so that NaN fails them.
+
+fn finite_not_negative(field: &str, v: f64) -> Result<(), Invalid> {
+    ensure(v >= 0.0 && v.is_finite(), field, "a finite number, at least 0", v)
 }
 
-fn finite_not_negative(field: &'static str, v: f64) -> Result<(), FitError> {
-    check(field, "a finite number, at least 0", v, v >= 0.0 && v.is_finite())
+fn positive(field: &str, v: f64) -> Result<(), Invalid> {
+    ensure(v > 0.0 && v.is_finite(), field, "a finite number above 0", v)
 }
 
-fn positive(field: &'static str, v: f64) -> Result<(), FitError> {
-    check(field, "a finite number above 0", v, v > 0.0 && v.is_finite())
+fn fraction(field: &str, v: f64) -> Result<(), Invalid> {
+    ensure((0.0..=1.0).contains(&v), field, "a number from 0 to 1", v)
 }
 
-fn fraction(field: &'static str, v: f64) -> Result<(), FitError> {
-    check(field, "a number from 0 to 1", v, (0.0..=1.0).contains(&v))
-}
-
-fn at_least_one(field: &'static str, v: usize) -> Result<(), FitError> {
-    check(field, "at least 1", v, v >= 1)
+fn at_least_one(field: &str, v: usize) -> Result<(), Invalid> {
+    ensure(v >= 1, field, "at least 1", v)
 }
 
 impl Rates {
-    fn check(&self) -> Result<(), FitError> {
+    fn check(&self) -> Result<(), Invalid> {
         finite_not_negative("rates.mean", self.mean)?;
         finite_not_negative("rates.scale", self.scale)?;
         finite_not_negative("rates.rotation", self.rotation)?;
         finite_not_negative("rates.opacity", self.opacity)?;
         finite_not_negative("rates.color", self.color)
     }
-}
-
-fn check_render_size(size: Option<u32>) -> Result<(), FitError> {
-    check("render_size", "at least 1 pixel", size.unwrap_or(1), size != Some(0))
 }
 
 /// Enough for any use, and few enough that their memory (about 200 bytes each) does not decide.
@@ -224,16 +194,17 @@ impl FitConfig {
     pub fn check(&self) -> Result<(), FitError> {
         at_least_one("iterations", self.iterations)?;
         let most = self.cap_max;
-        check("cap_max", "1 to 16777216", most, (1..=MAX_GAUSSIANS).contains(&most))?;
-        check("initial", "1 to cap_max", self.initial, (1..=most).contains(&self.initial))?;
+        ensure((1..=MAX_GAUSSIANS).contains(&most), "cap_max", "1 to 16777216", most)?;
+        ensure((1..=most).contains(&self.initial), "initial", "1 to cap_max", self.initial)?;
         let strict = |v: f64| v > 0.0 && v < 1.0;
-        check("initial_opacity", "between 0 and 1", self.initial_opacity, strict(self.initial_opacity))?;
-        check("dead_opacity", "between 0 and 1", self.dead_opacity, strict(self.dead_opacity))?;
+        ensure(strict(self.initial_opacity), "initial_opacity", "between 0 and 1", self.initial_opacity)?;
+        ensure(strict(self.dead_opacity), "dead_opacity", "between 0 and 1", self.dead_opacity)?;
         positive("initial_scale", self.initial_scale)?;
         positive("radius", self.radius)?;
         at_least_one("refine_every", self.refine_every)?;
         fraction("growth_stop", self.growth_stop)?;
-        check("growth", "a finite number, at least 1", self.growth, self.growth >= 1.0 && self.growth.is_finite())?;
+        let grows = self.growth >= 1.0 && self.growth.is_finite();
+        ensure(grows, "growth", "a finite number, at least 1", self.growth)?;
         self.rates.check()?;
         positive("rates.mean", self.rates.mean)?;
         positive("final_mean_rate", self.final_mean_rate)?;
@@ -242,12 +213,16 @@ impl FitConfig {
         finite_not_negative("scale_regularizer", self.scale_regularizer)?;
         finite_not_negative("noise_lr", self.noise_lr)?;
         at_least_one("views_per_step", self.views_per_step)?;
-        check_render_size(self.render_size)
+        Ok(ensure(self.render_size != Some(0), "render_size", "at least 1 pixel", 0)?)
     }
 }
 
+/// Rounds of relocation and growth of an optimization, spread evenly over the steps up to [`GROWTH_STOP`].
+const GROWTH_ROUNDS: usize = 16;
 /// Part of the steps of an optimization after which there are no more rounds of growth: the last Gaussians have to settle.
 const GROWTH_STOP: f64 = 5.0 / 6.0;
+/// Learning rate of the centers at the end of an optimization, reached exponentially. The others are constant.
+const FINAL_MEAN_RATE: f64 = 1.5e-5;
 
 /// Photos that the defaults of an optimization are for, and those from which on more change nothing.
 const PHOTOS: usize = 4;
@@ -274,7 +249,7 @@ impl OptimizationConfig {
         let grown = |size: u32| ((f64::from(size) * more.sqrt()).round() as u32).min(size.max(MOST_GROWN));
         Self {
             steps: self.steps * photos / PHOTOS,
-            render_size: self.render_size.map(grown),
+            render_size: grown(self.render_size),
             anchors: AnchorConfig { weight: self.anchors.weight / more.powf(1.5), ..self.anchors },
             ..self
         }
@@ -285,8 +260,7 @@ impl OptimizationConfig {
     /// Photos, whose longest side has `longest` pixels, have no finer detail than their pixels: it is as much as they can show at most.
     #[must_use]
     pub fn detailed(self, detail: usize, longest: u32) -> Self {
-        let shown = self.render_size.map_or(usize::MAX, |size| longest.div_ceil(size.max(1)) as usize);
-        let detail = detail.min(shown);
+        let detail = detail.min(longest.div_ceil(self.render_size.max(1)) as usize);
         if detail < 2 {
             return self;
         }
@@ -294,7 +268,7 @@ impl OptimizationConfig {
         Self {
             steps: self.steps.saturating_mul(detail) / 2,
             gaussians: self.gaussians.saturating_mul(detail),
-            render_size: self.render_size.map(grown),
+            render_size: grown(self.render_size),
             coarse: COARSE,
             window: WINDOW,
             coarse_size: (grown(self.coarse_size) / 2).max(1),
@@ -303,56 +277,28 @@ impl OptimizationConfig {
         }
     }
 
-    /// Refuses values that no optimization can work with.
-    pub fn check(&self) -> Result<(), FitError> {
-        let steps = self.steps;
-        at_least_one("steps", steps)?;
-        check("gaussians", "1 to 16777216", self.gaussians, (1..=MAX_GAUSSIANS).contains(&self.gaussians))?;
-        self.rates.check()?;
-        positive("rates.mean", self.rates.mean)?;
-        positive("final_mean_rate", self.final_mean_rate)?;
-        fraction("lambda_ssim", self.lambda_ssim)?;
-        check_render_size(self.render_size)?;
-        fraction("coarse", self.coarse)?;
-        check("window", "a number above 0, at most 1", self.window, self.window > 0.0 && self.window <= 1.0)?;
-        check("coarse_size", "at least 1 pixel", self.coarse_size, self.coarse_size > 0)?;
-        self.anchors.check()
-    }
-
     /// The fit that goes on from a cloud of `start` Gaussians.
     pub(crate) fn fit(&self, start: usize) -> FitConfig {
         let most = self.gaussians.max(start);
         // A round comes at every multiple of the interval but step 0.
         let last = GROWTH_STOP * self.steps as f64;
-        let interval = ((last / (self.growth_rounds + 1) as f64) as usize).max(1);
+        let interval = ((last / (GROWTH_ROUNDS + 1) as f64) as usize).max(1);
         let rounds = ((last / interval as f64).ceil() as i32 - 1).max(1);
         FitConfig {
             iterations: self.steps,
             cap_max: most,
             initial: start,
             refine_every: interval,
-            growth_start: if self.growth_rounds == 0 { usize::MAX } else { interval },
+            growth_start: interval,
             growth_stop: GROWTH_STOP,
             // One Gaussian more, since rounds round down.
             growth: (most as f64 / start as f64).powf(1.0 / f64::from(rounds)) + 1.0 / start as f64,
             rates: self.rates,
-            final_mean_rate: self.final_mean_rate,
-            lambda_ssim: self.lambda_ssim,
-            background: self.background,
-            render_size: self.render_size,
+            final_mean_rate: FINAL_MEAN_RATE,
+            render_size: Some(self.render_size),
             seed: self.seed,
             ..FitConfig::default()
         }
-    }
-}
-
-impl AnchorConfig {
-    fn check(&self) -> Result<(), FitError> {
-        finite_not_negative("anchors.weight", self.weight)?;
-        check("anchors.views", "1 to 1000", self.views, (1..=1000).contains(&self.views))?;
-        check("anchors.size", "16 to 1024", self.size, (16..=1024).contains(&self.size))?;
-        at_least_one("anchors.every", self.every)?;
-        positive("anchors.radius", self.radius)
     }
 }
 
@@ -367,18 +313,15 @@ mod tests {
             assert_eq!(config.clone().for_photos(photos), config);
         }
         let eight = config.clone().for_photos(8);
-        assert_eq!((eight.steps, eight.render_size), (1000, Some(362)));
+        assert_eq!((eight.steps, eight.render_size), (1000, 362));
         assert!((eight.anchors.weight - 0.1 / 8f64.sqrt()).abs() < 1e-12);
         let sixteen = config.clone().for_photos(16);
-        assert_eq!((sixteen.steps, sixteen.render_size, sixteen.anchors.weight), (2000, Some(512), 0.1 / 8.0));
+        assert_eq!((sixteen.steps, sixteen.render_size, sixteen.anchors.weight), (2000, 512, 0.1 / 8.0));
         assert_eq!(config.clone().for_photos(usize::MAX), sixteen);
-        sixteen.check().unwrap();
         // What is as large already stays.
         let detailed = config.clone().detailed(2, 4000).for_photos(8);
-        assert_eq!((detailed.steps, detailed.render_size, detailed.gaussians), (1000, Some(512), 16_384));
-        assert_eq!(config.clone().detailed(4, 4000).for_photos(16).render_size, Some(1024));
-        let whole = OptimizationConfig { render_size: None, ..config };
-        assert_eq!(whole.for_photos(8).render_size, None);
+        assert_eq!((detailed.steps, detailed.render_size, detailed.gaussians), (1000, 512, 16_384));
+        assert_eq!(config.clone().detailed(4, 4000).for_photos(16).render_size, 1024);
     }
 
     #[test]
@@ -390,34 +333,28 @@ mod tests {
         let two = config.clone().detailed(2, 512);
         assert_eq!(
             (two.steps, two.gaussians, two.render_size, two.anchors.weight),
-            (500, 16_384, Some(512), 1.5 * 0.1 / 2.0)
+            (500, 16_384, 512, 1.5 * 0.1 / 2.0)
         );
         assert_eq!((two.coarse, two.coarse_size, two.window), (0.6, 256, 0.6));
         let four = config.clone().detailed(4, 4000);
-        assert_eq!((four.steps, four.gaussians, four.render_size, four.coarse_size), (1000, 32_768, Some(1024), 512));
+        assert_eq!((four.steps, four.gaussians, four.render_size, four.coarse_size), (1000, 32_768, 1024, 512));
         assert_eq!(four.anchors.weight, 1.5 * 0.1 / 4.0);
-        four.check().unwrap();
         // No more than photos show.
         assert_eq!(config.clone().detailed(4, 512), two);
         assert_eq!(config.clone().detailed(4, 257), two);
         assert_eq!(config.clone().detailed(4, 256), config);
-        let whole = OptimizationConfig { render_size: None, ..config };
-        assert_eq!(whole.detailed(4, 100).render_size, None);
     }
 
     #[test]
     fn defaults_pass_and_survive_serde() {
         FitConfig::default().check().unwrap();
-        OptimizationConfig::default().check().unwrap();
         let text = serde_json::to_string(&FitConfig::default()).unwrap();
         assert_eq!(serde_json::from_str::<FitConfig>(&text).unwrap(), FitConfig::default());
-        assert_eq!(serde_json::from_str::<OptimizationConfig>("{}").unwrap(), OptimizationConfig::default());
     }
 
     #[test]
     fn unknown_fields_are_refused() {
         assert!(serde_json::from_str::<FitConfig>("{\"iteration\": 3}").is_err());
-        assert!(serde_json::from_str::<OptimizationConfig>("{\"step\": 3}").is_err());
     }
 
     #[test]
@@ -436,34 +373,15 @@ mod tests {
         refused(&|c| c.lambda_ssim = 1.1, "lambda_ssim");
         refused(&|c| c.rates.color = f64::INFINITY, "rates.color");
         refused(&|c| c.render_size = Some(0), "render_size");
-        let refused = |change: &dyn Fn(&mut OptimizationConfig), field: &str| {
-            let mut config = OptimizationConfig::default();
-            change(&mut config);
-            let message = config.check().unwrap_err().to_string();
-            assert!(message.starts_with(field), "{message}");
-        };
-        refused(&|c| c.steps = 0, "steps");
-        refused(&|c| c.gaussians = 0, "gaussians");
         refused(&|c| c.rates.mean = 0.0, "rates.mean");
         refused(&|c| c.final_mean_rate = f64::NAN, "final_mean_rate");
-        refused(&|c| c.coarse = 1.5, "coarse");
-        refused(&|c| c.coarse_size = 0, "coarse_size");
-        refused(&|c| c.window = 0.0, "window");
-        refused(&|c| c.window = f64::NAN, "window");
-        refused(&|c| c.anchors.weight = -1.0, "anchors.weight");
-        refused(&|c| c.anchors.views = 0, "anchors.views");
-        refused(&|c| c.anchors.size = 8, "anchors.size");
-        refused(&|c| c.anchors.every = 0, "anchors.every");
-        refused(&|c| c.anchors.radius = f64::INFINITY, "anchors.radius");
     }
 
     /// However few the steps and large the start, the fit is possible and its growth reaches the number asked for.
     #[test]
     fn an_optimization_grows_to_its_number() {
-        for (steps, start, growth_rounds) in
-            [(500, 1024, 16), (1, 1024, 16), (20, 1, 16), (1000, 5000, 16), (300, 9, 0), (7, 3, 1)]
-        {
-            let config = OptimizationConfig { steps, growth_rounds, ..Default::default() };
+        for (steps, start) in [(500, 1024), (1, 1024), (20, 1), (1000, 5000), (7, 3)] {
+            let config = OptimizationConfig { steps, ..Default::default() };
             let fit = config.fit(start);
             fit.check().unwrap();
             let due = |step: &usize| {
@@ -472,8 +390,8 @@ mod tests {
                     && (*step as f64) < fit.growth_stop * steps as f64
             };
             let rounds = (0..steps).filter(due).count();
-            assert_eq!(rounds > 0, growth_rounds > 0 && steps > 2, "{rounds} of {growth_rounds}");
-            assert!(rounds <= 2 * growth_rounds, "{rounds} of {growth_rounds}");
+            assert_eq!(rounds > 0, steps > 2, "{rounds} of {GROWTH_ROUNDS}");
+            assert!(rounds <= 2 * GROWTH_ROUNDS, "{rounds} of {GROWTH_ROUNDS}");
             let grown = (0..rounds).fold(start, |count, _| crate::mcmc::grown(count, &fit));
             assert!(rounds == 0 || grown == start.max(8192), "{grown} after {rounds}");
         }

@@ -3,11 +3,11 @@
 use std::ops::ControlFlow;
 
 use freerange_gaussians::{Alignment, Gaussians, LodTree};
+use freerange_util::ensure;
 use serde::{Deserialize, Serialize};
 
 use crate::{
     Evidence, FitConfig, FitError, FitProgress,
-    config::check,
     fit::{fit, fit_targets},
     views::Targets,
 };
@@ -33,9 +33,9 @@ impl Default for InitialFitConfig {
 impl InitialFitConfig {
     /// Refuses values that no fit can work with.
     pub fn check(&self) -> Result<(), FitError> {
-        check("iterations", "1 to 100000", self.iterations, (1..=100_000).contains(&self.iterations))?;
-        check("gaussians", "1 to 65536", self.gaussians, (1..=65_536).contains(&self.gaussians))?;
-        check("render_size", "8 to 4096 pixels", self.render_size, (8..=4096).contains(&self.render_size))
+        ensure((1..=100_000).contains(&self.iterations), "iterations", "1 to 100000", self.iterations)?;
+        ensure((1..=65_536).contains(&self.gaussians), "gaussians", "1 to 65536", self.gaussians)?;
+        Ok(ensure((8..=4096).contains(&self.render_size), "render_size", "8 to 4096 pixels", self.render_size)?)
     }
 
     fn config(&self, seed: u64) -> FitConfig {
@@ -64,8 +64,20 @@ pub fn initial_fit<'a>(
     seed: u64,
     progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Gaussians, FitError> {
+    fit_from(None, seen, config, seed, progress)
+}
+
+/// The same from `start`, where there is one: it keeps its number of Gaussians, whatever `config` says of that.
+pub(crate) fn fit_from<'a>(
+    start: Option<&Gaussians>,
+    seen: impl Into<Evidence<'a>>,
+    config: &InitialFitConfig,
+    seed: u64,
+    progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
+) -> Result<Gaussians, FitError> {
     config.check()?;
-    fit(seen, None, &config.config(seed), progress)
+    let gaussians = start.map_or(config.gaussians, Gaussians::len);
+    fit(seen, start, &InitialFitConfig { gaussians, ..config.clone() }.config(seed), progress)
 }
 
 /// For each of some views an [`initial_fit`] of all the others. They are shrunk once for all of these fits, and not needed any more.
@@ -96,26 +108,8 @@ impl LeaveOneOut {
         if targets.views == 0 {
             return Err(FitError::NoViews);
         }
-        config.check()?;
         fit_targets(&targets, None, &config, progress)
     }
-}
-
-/// `cloud`, moved by as short a fit of what is `seen`: what a sample needs that the views do not look like. It keeps its
-/// number of Gaussians, whatever `config` says of that.
-///
-/// # Errors
-/// Those of [`fit`](crate::fit()).
-pub(crate) fn continue_fit<'a>(
-    cloud: &Gaussians,
-    seen: impl Into<Evidence<'a>>,
-    config: &InitialFitConfig,
-    seed: u64,
-    progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
-) -> Result<Gaussians, FitError> {
-    config.check()?;
-    let own = InitialFitConfig { gaussians: cloud.len(), ..config.clone() };
-    fit(seen, Some(cloud), &own.config(seed), progress)
 }
 
 /// `cloud` as `2^depth` Gaussians in the order of its level-of-detail tree, axes labeled by the world's: as the network

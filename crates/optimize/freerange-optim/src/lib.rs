@@ -33,7 +33,7 @@ mod tests;
 mod views;
 
 pub use axis::{Axis, FoundAxis, axis_steps, find_axis, turned};
-pub use config::{AnchorConfig, Background, FitConfig, OptimizationConfig, Rates};
+pub use config::{AnchorConfig, FitConfig, OptimizationConfig, Rates};
 pub use error::FitError;
 pub use fit::fit;
 pub use frame::frame_of;

@@ -34,7 +34,7 @@ pub(crate) fn relocation(opacity: f64, copies: usize) -> (f64, f64) {
 /// Makes Gaussian `i` one of `copies` that look together as it does.
 pub(crate) fn split(cloud: &mut Gaussians, i: usize, copies: usize) {
     let (opacity, factor) = relocation(cloud.opacity(i), copies.min(MAX_COPIES));
-    let row = &mut cloud.as_mut_rows()[i];
+    let row = row_mut(cloud, i);
     row[channel::LOGIT_OPACITY] = (opacity / (1.0 - opacity)).ln() as f32;
     row[channel::LOG_SCALE].iter_mut().for_each(|s| *s += factor.ln() as f32);
 }
@@ -75,7 +75,7 @@ fn place(cloud: &mut Gaussians, adam: &mut Adam, weights: &[f64], targets: &[usi
     }
     for (&target, &source) in targets.iter().zip(&sources) {
         let row = *cloud.row(source);
-        cloud.as_mut_rows()[target] = row;
+        *row_mut(cloud, target) = row;
         adam.forget(target);
     }
 }
@@ -98,7 +98,7 @@ pub(crate) fn add_noise(cloud: &mut Gaussians, strength: f64, dead_opacity: f64,
         }
         let xi = DVec3::from_array(std::array::from_fn(|_| rng.sample(StandardNormal)));
         let moved = cloud.mean(i) + noise(cloud, i, xi, strength, dead_opacity);
-        cloud.as_mut_rows()[i][channel::MEAN].copy_from_slice(&moved.as_vec3().to_array());
+        row_mut(cloud, i)[channel::MEAN].copy_from_slice(&moved.as_vec3().to_array());
     }
 }
 
@@ -107,15 +107,9 @@ fn noise(cloud: &Gaussians, i: usize, xi: DVec3, strength: f64, dead_opacity: f6
     cloud.covariance(i) * (xi * (gate * strength))
 }
 
-/// Rows of a cloud by index.
-trait Rows {
-    fn as_mut_rows(&mut self) -> &mut [[f32; channel::COUNT]];
-}
-
-impl Rows for Gaussians {
-    fn as_mut_rows(&mut self) -> &mut [[f32; channel::COUNT]] {
-        self.rows_mut().as_chunks_mut().0
-    }
+/// The channels of Gaussian `i`, to change in place.
+fn row_mut(cloud: &mut Gaussians, i: usize) -> &mut [f32; channel::COUNT] {
+    &mut cloud.iter_mut().into_slice()[i]
 }
 
 #[cfg(test)]

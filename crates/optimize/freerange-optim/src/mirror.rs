@@ -223,7 +223,7 @@ mod tests {
     use std::f64::consts::PI;
 
     use super::*;
-    use crate::tests::{ball, cameras, own, photograph};
+    use crate::tests::{ball, cameras, own, photograph, photos};
     use freerange_gaussians::channel;
 
     /// Round Gaussians, so that turning them is no matter.
@@ -250,10 +250,6 @@ mod tests {
         let half = round(n, seed);
         let both = half.iter().chain(behind(&half, mirror).iter()).copied().collect::<Vec<_>>();
         Gaussians::from_rows(both.into_iter().flatten().collect())
-    }
-
-    fn photos(cloud: &Gaussians) -> Vec<View> {
-        cameras(4, 64, 0.3).iter().map(|c| photograph(cloud, c)).collect()
     }
 
     const MIRROR: Mirror = Mirror { normal: DVec3::new(0.6, 0.64, 0.48), offset: 0.05 };

@@ -260,7 +260,7 @@ mod tests {
         views[2] = ring(3, 40, &ball(12, 1)).remove(2);
         let targets = Targets::new(&views, Some(32)).unwrap();
         assert_eq!(targets.groups(&[0, 1, 2]).map(|(group, _)| group.len()).collect::<Vec<_>>(), [2, 1]);
-        let anchors = AnchorConfig { weight: 0.5, views: 5, size: 24, ..Default::default() };
+        let anchors = AnchorConfig { weight: 0.5, views: 5, size: 24 };
         let anchors = Anchors::new(&[ball(12, 2)], &targets, &anchors).unwrap();
         let value = |cloud: &Gaussians| {
             let mut o = Objective::photometric(cloud, &targets, &[0, 2], [0.3, 0.6, 0.1], 0.2).unwrap();

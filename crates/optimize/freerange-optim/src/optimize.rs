@@ -15,6 +15,7 @@ use std::ops::ControlFlow;
 
 /// Longest side, in pixels, of silhouettes. They come from guesses, which nobody vouches for to the pixel.
 const SILHOUETTES: u32 = 128;
+
 /// Improves a cloud's agreement with posed views, and shows more detail by more Gaussians.
 ///
 /// Few views say little of the rest of the object, and Gaussians that only they judge leave the object's surface. Hence
@@ -36,14 +37,13 @@ pub fn optimize<'a>(
     config: &OptimizationConfig,
     progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Gaussians, FitError> {
-    config.check()?;
     let seen = seen.into();
-    let targets = Targets::new(seen.views.clone(), config.render_size)?;
+    let targets = Targets::new(seen.views.clone(), Some(config.render_size))?;
     let first = (config.coarse * config.steps as f64) as usize;
     let coarse = (first > 0).then(|| Targets::new(seen.views.clone(), Some(config.coarse_size))).transpose()?;
     let further = seen.silhouettes.len();
-    let size = config.render_size.map_or(SILHOUETTES, |size| size.min(SILHOUETTES));
-    let silhouettes = (further > 0).then(|| Targets::new(seen, Some(size))).transpose()?;
+    let size = Some(config.render_size.min(SILHOUETTES));
+    let silhouettes = (further > 0).then(|| Targets::new(seen, size)).transpose()?;
     let clouds = std::iter::once(cloud).chain(others).map(|cloud| checked(cloud, usize::MAX));
     let clouds = clouds.collect::<Result<Vec<_>, _>>()?;
     let anchors = Anchors::new(&clouds, coarse.as_ref().unwrap_or(&targets), &config.anchors)?;
@@ -65,7 +65,7 @@ pub fn optimize<'a>(
         let by_silhouette =
             by_silhouette.map(|targets| (targets, next_views(&mut silhouette_queue, further, 1, &mut anchor_rng)));
         // The other ones than those of silhouettes.
-        let held = if anchors.due(step) { anchors.views() } else { 0 };
+        let held = if Anchors::due(step) { anchors.views() } else { 0 };
         let held = next_views(&mut queue, held, 1, &mut anchor_rng);
         let (by_silhouette, held) = rayon::join(
             || by_silhouette.map(|(targets, chosen)| Objective::silhouettes(cloud, targets, &chosen)).transpose(),

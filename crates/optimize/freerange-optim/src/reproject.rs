@@ -80,8 +80,7 @@ struct Photo<'a> {
 
 impl<'a> Photo<'a> {
     fn new(photos: &'a Targets, i: usize, sets: &[Gaussians]) -> Result<Self, FitError> {
-        let (camera, image, chosen) = (photos.cameras[i], &*photos.images[i], [i]);
-        let raster = photos.groups(&chosen).next().map_or_else(RasterConfig::default, |(_, raster)| *raster);
+        let (camera, image) = (photos.cameras[i], &*photos.images[i]);
         let (w, h) = image.dimensions();
         let solid = |i: u32| {
             let (x, y) = (i % w, i / w);
@@ -93,7 +92,7 @@ impl<'a> Photo<'a> {
             camera,
             image,
             weight: photos.weights[i],
-            depth: depths(&camera, &raster, sets)?,
+            depth: depths(&camera, &photos.rasters[i], sets)?,
             solid: (0..w * h).into_par_iter().map(solid).collect(),
         })
     }

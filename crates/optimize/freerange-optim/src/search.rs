@@ -9,7 +9,7 @@ use freerange_scene::camera::Camera;
 use glam::DVec3;
 use rayon::prelude::*;
 
-use crate::{Evidence, FitError, FitProgress, InitialFitConfig, initial::continue_fit, initial_fit, views::Targets};
+use crate::{Evidence, FitError, FitProgress, InitialFitConfig, initial::fit_from, views::Targets};
 
 /// Longest side, in pixels, of the silhouettes that symmetries are judged by.
 pub(crate) const OUTLINE: u32 = 64;
@@ -59,10 +59,7 @@ impl<P: FnMut(usize) -> ControlFlow<()>> Search<'_, P> {
             ended = told.is_break();
             told
         };
-        let cloud = match start {
-            None => initial_fit(seen, config, self.seed, tell)?,
-            Some(start) => continue_fit(start, seen, config, self.seed, tell)?,
-        };
+        let cloud = fit_from(start, seen, config, self.seed, tell)?;
         self.done += config.iterations;
         Ok((!ended).then_some(cloud))
     }
@@ -150,9 +147,7 @@ impl<'a> Pictures<'a> {
         for (i, pixels) in self.pixels.iter().enumerate() {
             let cameras = cameras(i);
             let (width, _) = targets.size(i);
-            let one = [i];
-            let (_, raster) = targets.groups(&one).next().expect("one view is one group");
-            let output = render(cloud.rows(), &cameras, &vec![[0.0; 3]; cameras.len()], raster)?;
+            let output = render(cloud.rows(), &cameras, &vec![[0.0; 3]; cameras.len()], &targets.rasters[i])?;
             let rows = output.rgb.as_chunks::<3>().0.chunks_exact(width).zip(output.alpha.chunks_exact(width));
             for ((rgb, alpha), expected) in rows.zip(pixels.chunks_exact(width).cycle()) {
                 for x in 0..width {

@@ -1,7 +1,7 @@
 //! Fits of small scenes that the rasterizer itself has drawn, and what all tests share.
 
 use crate::*;
-use crate::{anchors::Anchors, initial::continue_fit, views::Targets};
+use crate::{anchors::Anchors, initial::fit_from, views::Targets};
 use freerange_gaussians::{Gaussians, channel};
 use freerange_raster::{RasterConfig, render};
 use freerange_scene::camera::{Camera, View, Window};
@@ -157,6 +157,11 @@ fn parts_of_images_and_all_views_but_one_are_no_copies() {
     assert_eq!(found.rows(), initial_fit(&others, &config, 5, go).unwrap().rows());
 }
 
+/// Photos that searches for symmetries are tested with.
+pub(crate) fn photos(cloud: &Gaussians) -> Vec<View> {
+    cameras(4, 64, 0.3).iter().map(|c| photograph(cloud, c)).collect()
+}
+
 /// What searches for symmetries begin with.
 pub(crate) fn own(views: &[View], config: &InitialFitConfig) -> Gaussians {
     initial_fit(views, config, 0, go).unwrap()
@@ -167,15 +172,8 @@ pub(crate) fn ring(count: usize, size: u32, cloud: &Gaussians) -> Vec<View> {
     cameras(count, size, 0.0).iter().map(|c| photograph(cloud, c)).collect()
 }
 
-/// Mean PSNR in dB of the cloud against views, over white.
 fn psnr(cloud: &Gaussians, views: &[View]) -> f64 {
-    let values = views.iter().map(|v| {
-        let out = render(cloud.rows(), &[v.camera], &[[1.0; 3]], &RasterConfig::default()).unwrap();
-        let shown: Vec<f32> = out.rgb.iter().map(|v| v.clamp(0.0, 1.0)).collect();
-        freerange_raster::metrics::psnr(&shown, &freerange_scene::camera::image_ops::composite(&v.image, [1.0; 3]))
-            .unwrap()
-    });
-    values.sum::<f64>() / views.len() as f64
+    psnr_over_white(cloud, views).unwrap()
 }
 
 pub(crate) fn go(_: &FitProgress<'_>) -> ControlFlow<()> {
@@ -251,7 +249,7 @@ fn continuing_keeps_the_number_and_comes_nearer() {
     let rough = disturbed(&scene, 9);
     let mut steps = 0;
     let config = InitialFitConfig { iterations: 150, gaussians: 7, render_size: 32 };
-    let continued = continue_fit(&rough, &views, &config, 3, |p| {
+    let continued = fit_from(Some(&rough), &views, &config, 3, |p| {
         steps = p.steps;
         ControlFlow::Continue(())
     })
@@ -259,10 +257,9 @@ fn continuing_keeps_the_number_and_comes_nearer() {
     assert_eq!((steps, continued.len()), (150, 30));
     let [before, after] = [&rough, &continued].map(|cloud| psnr(cloud, &views));
     assert!(after > before + 2.0, "{before} dB, continued {after} dB");
-    assert!(continue_fit(&Gaussians::default(), &views, &config, 3, go).is_err());
+    assert!(fit_from(Some(&Gaussians::default()), &views, &config, 3, go).is_err());
 }
 
-/// A cloud as a generator might give it: right on the whole, wrong in detail.
 fn evidence<'a>(views: &'a [View], silhouettes: &'a [View]) -> Evidence<'a> {
     Evidence { silhouettes: silhouettes.iter().map(PosedImage::from).collect(), ..views.into() }
 }
@@ -297,6 +294,7 @@ fn silhouettes_are_fitted_to() {
     assert!(matches!(fit(evidence(&[], &silhouettes), None, &config, go), Err(FitError::NoViews)));
 }
 
+/// A cloud as a generator might give it: right on the whole, wrong in detail.
 fn disturbed(cloud: &Gaussians, seed: u64) -> Gaussians {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut out = cloud.clone();
@@ -310,20 +308,6 @@ fn disturbed(cloud: &Gaussians, seed: u64) -> Gaussians {
 
 fn small_anchors() -> AnchorConfig {
     AnchorConfig { size: 48, ..Default::default() }
-}
-
-#[test]
-fn anchors_weigh_as_much_however_seldom_they_are_looked_at() {
-    let photos = Targets::new(&ring(4, 32, &ball(12, 1)), None).unwrap();
-    let at = |every| Anchors::new(&[ball(12, 1)], &photos, &AnchorConfig { every, ..small_anchors() }).unwrap();
-    let loss = |anchors: &Anchors| anchors.objective(&ball(12, 2), 3, [0.2; 3]).unwrap().loss;
-    for every in [1, 2, 3] {
-        let anchors = at(every);
-        assert_eq!((1..=12).filter(|&step| anchors.due(step)).count() * every, 12);
-        assert!((loss(&anchors) / loss(&at(1)) - every as f64).abs() < 1e-6);
-    }
-    // Silhouettes come at even steps.
-    assert!(at(2).due(1) && !at(2).due(2));
 }
 
 #[test]
@@ -383,7 +367,7 @@ fn refining_may_begin_with_small_pictures() {
     let scene = ball(60, 21);
     let (start, views) = (disturbed(&scene, 22), ring(4, 64, &scene));
     let optimized = |coarse, coarse_size, render_size| {
-        let (render_size, anchors) = (Some(render_size), small_anchors());
+        let anchors = small_anchors();
         let config = OptimizationConfig {
             steps: 20,
             gaussians: 90,
@@ -413,15 +397,7 @@ fn clouds_are_optimized_together() {
         let anchors = small_anchors();
         // Too slow to move anything.
         let rates = Rates { mean: 1e-9, scale: 0.0, rotation: 0.0, opacity: 0.0, color: 0.0 };
-        let config = OptimizationConfig {
-            steps: 1,
-            growth_rounds: 0,
-            gaussians,
-            rates,
-            final_mean_rate: 1e-9,
-            anchors,
-            ..Default::default()
-        };
+        let config = OptimizationConfig { steps: 1, gaussians, rates, anchors, ..Default::default() };
         optimize(&start, others, &views, &config, go).unwrap()
     };
     let other = disturbed(&scene, 23);

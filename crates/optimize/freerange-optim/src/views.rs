@@ -4,7 +4,7 @@ use std::{borrow::Cow, sync::Arc};
 
 use crate::FitError;
 use freerange_raster::RasterConfig;
-use freerange_scene::camera::{Camera, View, Window, image_ops};
+use freerange_scene::camera::{Camera, View, Window, image_ops, pixel_of};
 use glam::{DMat3, DVec3};
 use image::{RgbaImage, imageops::crop_imm};
 use rand::Rng;
@@ -91,7 +91,8 @@ pub(crate) struct Targets {
     pub views: usize,
     /// How often each is looked at ([`PosedImage::weight`]).
     pub weights: Vec<f64>,
-    rasters: Vec<RasterConfig>,
+    /// How to render each.
+    pub rasters: Vec<RasterConfig>,
 }
 
 fn refuse<T>(view: &PosedImage<'_>, field: &'static str, expected: String, found: String) -> Result<T, FitError> {
@@ -239,12 +240,6 @@ impl Targets {
 
     /// Where that pixel is, row by row.
     pub fn place(&self, i: usize, point: DVec3) -> Option<usize> {
-        let c = &self.cameras[i];
-        let p = c.world_to_camera.transform_point3(point);
-        let (x, y) = (c.fx * p.x / p.z + c.cx, c.fy * p.y / p.z + c.cy);
-        // Phrased so that NaN fails it.
-        let (width, height) = self.size(i);
-        let inside = p.z > 0.0 && x >= 0.0 && y >= 0.0 && x < width as f64 && y < height as f64;
-        inside.then(|| y as usize * width + x as usize)
+        pixel_of(&self.cameras[i], point).map(|(pixel, _)| pixel)
     }
 }

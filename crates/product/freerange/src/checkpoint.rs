@@ -5,8 +5,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use freerange_model::EncoderWeights;
-use freerange_model::{Checkpoint, Dinov2, EncoderConfig, Header};
+use freerange_model::{Checkpoint, Dinov2, EncoderConfig, EncoderWeights, Header};
 use freerange_util::{IoError, sha256};
 
 use crate::{Device, Error, error::Lift, machine::weights_folder};

@@ -8,6 +8,7 @@ use freerange_gaussians::Gaussians;
 use freerange_model::{Checkpoint, Compute};
 use freerange_optim::InitialFitConfig;
 use freerange_scene::camera::FrameConfig;
+use freerange_util::ensure;
 use serde::{Deserialize, Serialize};
 
 use crate::{
@@ -176,10 +177,7 @@ impl PipelineConfig {
     /// Names the field.
     pub fn validate(&self) -> Result<(), Error> {
         let Self { network_views, symmetry, propose, refine, optimize } = self;
-        let check = |ok: bool, field: &str, expected: &str, found: String| match ok {
-            true => Ok(()),
-            false => Err(Error::input(field, expected, found)),
-        };
+        let check = |ok: bool, field: &str, expected: &str, found: String| ensure(ok, field, expected, found).lift();
         check((1..=256).contains(network_views), "network_views", "1 to 256", network_views.to_string())?;
         for (field, value) in [
             ("symmetry.reflection_threshold", symmetry.reflection_threshold),

@@ -154,108 +154,69 @@ impl<T, E: Beneath> Lift<T> for Result<T, E> {
     }
 }
 
-impl Beneath for Invalid {
-    fn lift(self) -> Error {
-        let Self { field, expected, found } = self;
-        Error::Input { field, expected, found }
-    }
-}
-
-impl Beneath for IoError {
-    fn lift(self) -> Error {
-        Error::io(&self.path.clone(), self)
-    }
-}
-
-impl Beneath for SceneError {
-    fn lift(self) -> Error {
-        match self {
-            Self::Camera(e) => e.lift(),
-            Self::Option(e) => e.lift(),
-            Self::Read(ref e) | Self::Write(ref e) => Error::io(&e.path.clone(), self),
-            e => Error::Scene(Cause::of(e)),
+/// What each of them is here.
+macro_rules! lifts {
+    ($($from:ident($error:ident) => $to:expr,)*) => {$(
+        impl Beneath for $from {
+            fn lift(self) -> Error {
+                let $error = self;
+                $to
+            }
         }
-    }
+    )*};
 }
 
-impl Beneath for CameraError {
-    fn lift(self) -> Error {
-        match self {
-            Self::Read(ref e) => Error::io(&e.path.clone(), self),
-            e => Error::Scene(Cause::of(e)),
+lifts! {
+    Invalid(e) => Error::Input { field: e.field, expected: e.expected, found: e.found },
+    IoError(e) => Error::io(&e.path.clone(), e),
+    SceneError(e) => match e {
+        SceneError::Camera(e) => e.lift(),
+        SceneError::Option(e) => e.lift(),
+        SceneError::Read(ref io) | SceneError::Write(ref io) => Error::io(&io.path.clone(), e),
+        e => Error::Scene(Cause::of(e)),
+    },
+    CameraError(e) => match e {
+        CameraError::Read(ref io) => Error::io(&io.path.clone(), e),
+        e => Error::Scene(Cause::of(e)),
+    },
+    FitError(e) => match e {
+        FitError::Config(e) => e.lift(),
+        FitError::Splat(e) => e.lift(),
+        FitError::Raster(e) => e.lift(),
+        FitError::Metrics(e) => e.lift(),
+        FitError::NoGaussians => Error::Gaussians(Cause::of(e)),
+        FitError::Diverged { .. } => Error::Computation(Cause::of(e)),
+        e => Error::Scene(Cause::of(e)),
+    },
+    FlowError(e) => match e {
+        FlowError::Cancelled => Error::Cancelled,
+        FlowError::Device { .. } => Error::DeviceFailed(e.to_string()),
+        FlowError::Config(e) => e.lift(),
+        FlowError::Fit(e) => e.lift(),
+        FlowError::Model(e) => e.lift(),
+        FlowError::Raster(e) => e.lift(),
+        FlowError::NoViews | FlowError::UnevenNumbers { .. } | FlowError::UnevenViews { .. } => {
+            Error::Scene(Cause::of(e))
         }
-    }
-}
-
-impl Beneath for FitError {
-    fn lift(self) -> Error {
-        match self {
-            Self::Config(e) => e.lift(),
-            Self::Splat(e) => e.lift(),
-            Self::Raster(e) => e.lift(),
-            Self::Metrics(e) => e.lift(),
-            e @ Self::NoGaussians => Error::Gaussians(Cause::of(e)),
-            e @ Self::Diverged { .. } => Error::Computation(Cause::of(e)),
-            e => Error::Scene(Cause::of(e)),
-        }
-    }
-}
-
-impl Beneath for FlowError {
-    fn lift(self) -> Error {
-        match self {
-            Self::Cancelled => Error::Cancelled,
-            Self::Device { .. } => Error::DeviceFailed(self.to_string()),
-            Self::Config(e) => e.lift(),
-            Self::Fit(e) => e.lift(),
-            Self::Model(e) => e.lift(),
-            Self::Raster(e) => e.lift(),
-            e @ (Self::NoViews | Self::UnevenNumbers { .. } | Self::UnevenViews { .. }) => Error::Scene(Cause::of(e)),
-            e => Error::Computation(Cause::of(e)),
-        }
-    }
-}
-
-impl Beneath for ModelError {
-    fn lift(self) -> Error {
-        match self {
-            Self::Io(e) => e.lift(),
-            e => Error::Checkpoint(Cause::of(e)),
-        }
-    }
-}
-
-impl Beneath for SplatError {
-    fn lift(self) -> Error {
-        match self {
-            Self::Io(e) => e.lift(),
-            e => Error::Gaussians(Cause::of(e)),
-        }
-    }
-}
-
-impl Beneath for FormatError {
-    fn lift(self) -> Error {
-        match self {
-            Self::Io(e) => e.lift(),
-            Self::Gaussians(e) => e.lift(),
-            e => Error::Gaussians(Cause::of(e)),
-        }
-    }
-}
-
-/// Cameras that cannot be rendered.
-impl Beneath for RasterError {
-    fn lift(self) -> Error {
-        Error::Scene(Cause::of(self))
-    }
-}
-
-/// Images that cannot be compared.
-impl Beneath for ImageError {
-    fn lift(self) -> Error {
-        Error::Scene(Cause::of(self))
-    }
+        e => Error::Computation(Cause::of(e)),
+    },
+    ModelError(e) => match e {
+        ModelError::Io(e) => e.lift(),
+        e => Error::Checkpoint(Cause::of(e)),
+    },
+    SplatError(e) => match e {
+        SplatError::Io(e) => e.lift(),
+        e => Error::Gaussians(Cause::of(e)),
+    },
+    FormatError(e) => match e {
+        FormatError::Io(e) => e.lift(),
+        FormatError::Gaussians(e) => e.lift(),
+        e => Error::Gaussians(Cause::of(e)),
+    },
+    // Cameras that cannot be rendered.
+    RasterError(e) => Error::Scene(Cause::of(e)),
+    // Images that cannot be compared.
+    ImageError(e) => Error::Scene(Cause::of(e)),
 }
 
 #[cfg(test)]

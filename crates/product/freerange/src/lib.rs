@@ -1,7 +1,5 @@
 //! Posed images of an object in, 3D Gaussians out, in the frame of the cameras.
 //!
-//!
-//! Architecture invariant: no training, no files but those of scenes and checkpoints.
 #![cfg_attr(feature = "embedded", doc = "```no_run")]
 #![cfg_attr(not(feature = "embedded"), doc = "```ignore")]
 //! use std::path::Path;

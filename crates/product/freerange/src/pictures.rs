@@ -9,7 +9,7 @@ use freerange_scene::camera::{
     image_ops::{composite, to_picture},
 };
 use freerange_util::IoError;
-use glam::{DMat4, DVec3};
+use glam::DVec3;
 use image::RgbaImage;
 use rayon::prelude::*;
 
@@ -42,8 +42,7 @@ fn in_units_of(cloud: &Gaussians, camera: &Camera) -> RasterConfig {
 pub fn render_splats(splats: &Splats, camera: &Camera, mode: RenderMode) -> Result<Vec<f32>, Error> {
     let cloud = splats.seen_from(camera.center());
     // Positions are relative to the origin, which may be far away.
-    let world_to_camera = camera.world_to_camera * DMat4::from_translation(splats.origin);
-    let camera = Camera { world_to_camera, ..*camera };
+    let camera = camera.relative_to(splats.origin);
     if mode != RenderMode::Mip {
         return render_view(&cloud, &camera);
     }
@@ -59,8 +58,7 @@ pub fn render_splats(splats: &Splats, camera: &Camera, mode: RenderMode) -> Resu
 /// # Errors
 /// If the rasterizer refuses the camera or the Gaussians.
 pub fn render_surface(splats: &Splats, camera: &Camera) -> Result<(Vec<f32>, Vec<[f32; 3]>), Error> {
-    let world_to_camera = camera.world_to_camera * DMat4::from_translation(splats.origin);
-    let camera = Camera { world_to_camera, ..*camera };
+    let camera = camera.relative_to(splats.origin);
     let cloud = &splats.cloud;
     let depth = surface_depth(cloud.rows(), &camera, &in_units_of(cloud, &camera)).lift()?;
     let normals = surface_normals(&depth, &camera);
@@ -103,6 +101,7 @@ pub fn write_turntable(path: &Path, cloud: &Gaussians, frames: u16, side: u16) -
 mod tests {
     use super::*;
     use freerange_gaussians::{Harmonics, channel, coefficients};
+    use glam::DMat4;
 
     /// A few Gaussians, as small as pixels.
     fn example(degree: usize) -> Splats {

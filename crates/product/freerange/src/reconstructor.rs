@@ -5,6 +5,7 @@ use std::path::Path;
 use freerange_diffusion::settings::Settings;
 use freerange_model::Checkpoint;
 use freerange_scene::camera::FrameConfig;
+use freerange_util::ensure;
 
 use crate::{
     Choices, Device, EncoderPlaces, Error, Init, Options,
@@ -106,12 +107,9 @@ impl Reconstructor {
         let kind = self.checkpoint.config.kind;
         config.propose.flow.validate_for(kind).map_err(|e| e.within("propose.flow").lift())?;
         let sampled = config.propose.init == Init::Flow && options.init.is_none();
-        let only = |ok: bool, field: &str, expected: &str, found: String| match ok {
-            true => Ok(()),
-            false => {
-                let expected = format!("{expected}: a {} model predicts in one pass", kind.name());
-                Err(Error::input(field, expected, found))
-            }
+        let only = |ok: bool, field: &str, expected: &str, found: String| {
+            let expected = format!("{expected}: a {} model predicts in one pass", kind.name());
+            ensure(ok, field, &expected, found).lift()
         };
         if kind.one_pass() {
             only(options.seeds.len() <= 1, "seeds", "one sample", options.seeds.len().to_string())?;

@@ -18,7 +18,7 @@ pub use frame::{
 };
 pub use freerange_util::image_ops;
 pub use lens::Lens;
-pub use pinhole::{Camera, View};
+pub use pinhole::{Camera, View, pixel_of};
 pub use plucker::plucker;
 pub use scene::{Scene, load_cameras, transforms_json};
 pub use selection::{SelectionConfig, ViewSets, inputs_around, inputs_beside, k_means, select_views};

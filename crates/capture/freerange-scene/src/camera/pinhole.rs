@@ -68,6 +68,17 @@ impl Camera {
     }
 }
 
+/// The pixel of `camera` that shows `point`, counted row by row, and the point's camera z. None outside of the image or
+/// behind the camera.
+#[inline]
+pub fn pixel_of(camera: &Camera, point: DVec3) -> Option<(usize, f64)> {
+    let p = camera.world_to_camera.transform_point3(point);
+    let (x, y) = (camera.fx * p.x / p.z + camera.cx, camera.fy * p.y / p.z + camera.cy);
+    // Phrased so that NaN fails it.
+    let inside = p.z > 0.0 && x >= 0.0 && y >= 0.0 && x < f64::from(camera.width) && y < f64::from(camera.height);
+    inside.then(|| (y as usize * camera.width as usize + x as usize, p.z))
+}
+
 /// A posed image: sRGB-encoded color with straight alpha, and the camera that took it.
 #[derive(Clone, Debug)]
 pub struct View {

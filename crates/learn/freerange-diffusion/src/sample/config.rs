@@ -1,9 +1,8 @@
 //! How a model is sampled from, and how it refines.
 
 use freerange_model::{Compute, ModelKind};
-use freerange_util::Invalid;
+use freerange_util::{Background, Invalid, ensure};
 
-use super::Background;
 use crate::coupling::Coupling;
 
 /// Number of the meaning of settings in records: of a pipeline, a sampler, fits and optimization. Raise it whenever the same
@@ -86,17 +85,12 @@ pub enum GradientAt {
     Estimate,
 }
 
-/// Refuses with the field's name unless `ok`, which is written so that NaN fails it.
-fn check(field: &str, expected: &str, found: impl ToString, ok: bool) -> Result<(), Invalid> {
-    if ok { Ok(()) } else { Err(Invalid::new(field, expected, found)) }
-}
-
 fn depth(field: &str, depth: Option<u32>) -> Result<(), Invalid> {
-    check(field, "1 to 20", format!("{depth:?}"), depth.is_none_or(|d| (1..=20).contains(&d)))
+    ensure(depth.is_none_or(|d| (1..=20).contains(&d)), field, "1 to 20", format!("{depth:?}"))
 }
 
 fn size(field: &str, size: u32) -> Result<(), Invalid> {
-    check(field, "8 to 4096 pixels", size, (8..=4096).contains(&size))
+    ensure((8..=4096).contains(&size), field, "8 to 4096 pixels", size)
 }
 
 impl FlowConfig {
@@ -105,10 +99,10 @@ impl FlowConfig {
     /// # Errors
     /// Names the setting.
     pub fn validate(&self) -> Result<(), Invalid> {
-        check("steps", "1 to 10000", self.steps, (1..=10_000).contains(&self.steps))?;
+        ensure((1..=10_000).contains(&self.steps), "steps", "1 to 10000", self.steps)?;
         depth("lod_depth", self.lod_depth)?;
         for (field, value) in [("cfg_scale", self.cfg_scale), ("lambda_pg", self.lambda_pg)] {
-            check(field, "a finite number, 0 or more", value, value.is_finite() && value >= 0.0)?;
+            ensure(value.is_finite() && value >= 0.0, field, "a finite number, 0 or more", value)?;
         }
         size("gradient_size", self.gradient_size)
     }
@@ -122,14 +116,14 @@ impl FlowConfig {
         if !kind.one_pass() {
             return Ok(());
         }
-        let only = |field: &str, expected: &str, found: String, ok: bool| {
+        let only = |ok: bool, field: &str, expected: &str, found: String| {
             let expected = format!("{expected} for a {} model, which predicts in one pass", kind.name());
-            check(field, &expected, found, ok)
+            ensure(ok, field, &expected, found)
         };
-        only("steps", "1", self.steps.to_string(), self.steps == 1)?;
-        only("cfg_scale", "1", self.cfg_scale.to_string(), self.cfg_scale == 1.0)?;
-        only("lambda_pg", "0", self.lambda_pg.to_string(), self.lambda_pg == 0.0)?;
-        only("lod_depth", "none", format!("{:?}", self.lod_depth), self.lod_depth.is_none())
+        only(self.steps == 1, "steps", "1", self.steps.to_string())?;
+        only(self.cfg_scale == 1.0, "cfg_scale", "1", self.cfg_scale.to_string())?;
+        only(self.lambda_pg == 0.0, "lambda_pg", "0", self.lambda_pg.to_string())?;
+        only(self.lod_depth.is_none(), "lod_depth", "none", format!("{:?}", self.lod_depth))
     }
 }
 
@@ -139,9 +133,9 @@ impl RefinerConfig {
     /// # Errors
     /// Names the setting.
     pub fn validate(&self) -> Result<(), Invalid> {
-        check("passes", "1 to 1000", self.passes, (1..=1000).contains(&self.passes))?;
+        ensure((1..=1000).contains(&self.passes), "passes", "1 to 1000", self.passes)?;
         let (every, most) = (self.retokenize_every, self.passes);
-        check("retokenize_every", "0 to 1000", every, every <= 1000.max(most))?;
+        ensure(every <= 1000.max(most), "retokenize_every", "0 to 1000", every)?;
         depth("lod_depth", self.lod_depth)?;
         size("gradient_size", self.gradient_size)
     }

@@ -163,7 +163,6 @@ impl Surface {
         if shared == 0 || common != shared || of_a.len() + of_b.len() - common <= 4 {
             return false;
         }
-        // A tetrahedron is the smallest closed surface.
         let normal = |t: [u32; 3], moved: bool| {
             let [p, q, r] = t.map(|v| if moved && (v == a || v == b) { point } else { self.positions[v as usize] });
             (q - p).cross(r - p)

@@ -2,8 +2,8 @@
 
 use freerange_gaussians::Splats;
 use freerange_raster::{RasterConfig, render};
-use freerange_scene::camera::Camera;
-use glam::{DVec2, DVec3, Vec3};
+use freerange_scene::camera::{Camera, pixel_of};
+use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 use crate::meshing::{Shape, SurfaceError, decimate::decimate, iso_surface, texture::bake};
@@ -179,7 +179,7 @@ impl Views {
         let (mut sum, mut weights, mut any, mut nearest) = (Vec3::ZERO, 0.0, Vec3::splat(0.5), f64::INFINITY);
         for (camera, picture) in self.cameras.iter().zip(&self.renders) {
             let facing = normal.dot((camera.center() - position).normalize());
-            let Some((z, pixel)) = pixel(camera, position) else { continue };
+            let Some((pixel, z)) = pixel_of(camera, position) else { continue };
             if picture.alpha[pixel] < OPAQUE {
                 continue;
             }
@@ -196,16 +196,6 @@ impl Views {
         let color = if weights > 0.0 { sum / weights } else { any };
         color.clamp(Vec3::ZERO, Vec3::ONE)
     }
-}
-
-/// Camera z of a point, and the number of the pixel it is seen at; none behind the camera or beside the picture.
-fn pixel(camera: &Camera, point: DVec3) -> Option<(f64, usize)> {
-    let p = camera.world_to_camera.transform_point3(point);
-    let at = DVec2::new(camera.fx * p.x / p.z + camera.cx, camera.fy * p.y / p.z + camera.cy);
-    let inside = p.z > 0.0
-        && at.cmpge(DVec2::ZERO).all()
-        && at.cmplt(DVec2::new(camera.width.into(), camera.height.into())).all();
-    inside.then(|| (p.z, at.y as usize * camera.width as usize + at.x as usize))
 }
 
 /// Mean distances to the surface along the lines of sight, in voxels, cut off; negative inside.
@@ -240,7 +230,7 @@ impl Volume {
 fn distance(views: &Views, point: DVec3, step: f64) -> f32 {
     let (mut sum, mut weights) = (0.0, 0.0);
     for (camera, picture) in views.cameras.iter().zip(&views.renders) {
-        let Some((z, pixel)) = pixel(camera, point) else { continue };
+        let Some((pixel, z)) = pixel_of(camera, point) else { continue };
         let distance = if picture.alpha[pixel] >= OPAQUE {
             (f64::from(picture.depth[pixel]) - z) / step
         } else if picture.alpha[pixel] < 0.5 * OPAQUE {

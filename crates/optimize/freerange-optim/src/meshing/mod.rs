@@ -22,7 +22,7 @@ pub use iso::iso_surface;
 pub use save::{MeshFormat, save};
 pub use shape::{Baked, Shape};
 
-/// Errors of this crate.
+/// Why there is no mesh, or no file of it.
 #[derive(Debug, thiserror::Error)]
 pub enum SurfaceError {
     /// The operating system refused to write a file.

@@ -6,7 +6,7 @@
 
 use freerange_gaussians::{Gaussians, channel};
 use freerange_raster::{RasterConfig, render};
-use freerange_scene::camera::View;
+use freerange_scene::camera::{View, pixel_of};
 use glam::DVec3;
 
 use crate::{Error, error::Lift};
@@ -29,15 +29,10 @@ pub(super) fn completed(own: Gaussians, fit: &Gaussians, photos: &[View]) -> Res
     for photo in photos {
         let camera = &photo.camera;
         let shown = render(own.rows(), &[*camera], &[[0.0; 3]], &RasterConfig::default()).lift()?;
-        let missing = |pixel: usize, alpha: u8| alpha >= 128 && shown.alpha[pixel] < 0.5;
+        let masks = photo.image.as_raw().as_chunks::<4>().0;
+        let missing = |(pixel, _): (usize, f64)| masks[pixel][3] >= 128 && shown.alpha[pixel] < 0.5;
         for (i, wanted) in wanted.iter_mut().enumerate() {
-            let p = camera.world_to_camera.transform_point3(fit.mean(i));
-            let (x, y) = (camera.fx * p.x / p.z + camera.cx, camera.fy * p.y / p.z + camera.cy);
-            // Phrased so that NaN fails it.
-            if p.z > 0.0 && x >= 0.0 && y >= 0.0 && x < f64::from(camera.width) && y < f64::from(camera.height) {
-                let (x, y) = (x as u32, y as u32);
-                *wanted |= missing((y * camera.width + x) as usize, photo.image.get_pixel(x, y).0[3]);
-            }
+            *wanted |= pixel_of(camera, fit.mean(i)).is_some_and(missing);
         }
     }
     let empty = |i: &usize| wanted[*i] && cell(fit.mean(*i)).is_some_and(|at| !filled[index(at)]);

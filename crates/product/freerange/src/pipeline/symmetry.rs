@@ -15,8 +15,7 @@ use freerange_scene::camera::View;
 use freerange_util::{Note, side_by_side};
 
 use super::{
-    CanonicalScene,
-    canonical::Photo,
+    CanonicalScene, Photo,
     watch::{Watch, flow},
 };
 use crate::{Detect, Error, PipelineConfig, Stage, error::Lift};
