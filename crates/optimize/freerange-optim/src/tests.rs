@@ -118,6 +118,11 @@ fn silhouettes_share_pictures() {
     let wrong = PosedImage { camera: from[0], ..PosedImage::from(&views[1]) };
     let refused = Targets::new(Evidence { silhouettes: vec![wrong], ..(&views[..1]).into() }, None).err().unwrap();
     assert!(matches!(refused, FitError::View { field: "image", .. }), "{refused}");
+    for weight in [0.5, -1.0, 2.0, f64::NAN] {
+        let view = PosedImage { weight, ..PosedImage::from(&views[0]) };
+        let refused = Targets::new(vec![view], None).err().unwrap();
+        assert!(matches!(refused, FitError::View { field: "weight", .. }), "{weight}: {refused}");
+    }
 }
 
 /// Parts of images are compared as if they had been cut out, and fits of all views but one share their images.

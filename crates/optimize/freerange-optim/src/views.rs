@@ -134,6 +134,15 @@ impl Targets {
         if seen.views.is_empty() {
             return Err(FitError::NoViews);
         }
+        // The order of views could not be drawn otherwise.
+        if seen.views.iter().all(|view| view.weight < 1.0) {
+            return refuse(
+                &seen.views[0],
+                "weight",
+                "1 for one view at least".into(),
+                seen.views[0].weight.to_string(),
+            );
+        }
         let views = seen.views.len();
         let all: Vec<PosedImage<'_>> = seen.views.into_iter().chain(seen.silhouettes).collect();
         all.iter().try_for_each(check)?;
