@@ -70,7 +70,10 @@ pub use device::{Device, DeviceInfo, DeviceName, DeviceProperties, GpuApi};
 pub use error::{Cause, Error};
 pub use files::{read_gaussians, read_splats, write_gaussians, write_splats};
 pub use frame::{choose_views, to_canonical, to_user};
-pub use freerange_diffusion::sample::{FlowConfig, RefinerConfig, SETTINGS_SCHEMA};
+pub use freerange_diffusion::{
+    coupling::Coupling,
+    sample::{FlowConfig, GradientAt, RefinerConfig, SETTINGS_SCHEMA},
+};
 pub use freerange_gaussians::{Gaussians, Harmonics, RenderMode, Splats};
 pub use freerange_model::Compute;
 pub use freerange_optim::InitialFitConfig;
@@ -80,7 +83,7 @@ pub use freerange_scene::{
     estimate::Hints,
     read::{Cameras, Format as CameraFormat, ReadConfig, Turntable},
 };
-pub use freerange_util::{Note, NoteKind, Stop};
+pub use freerange_util::{Background, Note, NoteKind, Stop};
 pub use glam;
 pub use image;
 pub use pipeline::{Reconstruction, Sample};
