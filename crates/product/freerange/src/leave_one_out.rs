@@ -3,14 +3,14 @@
 use std::ops::ControlFlow;
 
 use freerange_gaussians::Gaussians;
-use freerange_optim::{FitProgress, InitialFitConfig, LeaveOneOut};
+use freerange_optim::{FitProgress, InitialFitConfig, LeaveOneOut, PosedImage};
 use freerange_raster::RasterConfig;
-use freerange_scene::camera::{Camera, FrameConfig, View, canonical_from_user};
+use freerange_scene::camera::{Camera, FrameConfig, View, Window, canonical_from_user};
 use freerange_util::Stop;
 use image::{Rgba, RgbaImage};
 use rayon::prelude::*;
 
-use crate::{Error, error::Lift, pipeline::Photo};
+use crate::{Error, error::Lift};
 
 /// Shows each view as a quick fit of all the others has it: straight color and alpha, at its image's size, in the order of `views`, whose
 /// alpha is the object's mask. What one mask lacks by mistake others have, and the other way round. (`freerange_scene::estimate::LeaveOneOut`.)
@@ -26,7 +26,13 @@ fn shown(views: Vec<View>, stop: &Stop) -> Result<Vec<RgbaImage>, Error> {
     let config = InitialFitConfig { iterations: 150, gaussians: 2048, render_size: 128 };
     let place = canonical_from_user(&views, &FrameConfig::default()).lift()?.canonical_from_user;
     let cameras: Vec<Camera> = views.iter().map(|v| v.camera.transformed(&place)).collect();
-    let posed = views.iter().zip(&cameras).map(|(view, camera)| Photo::new(view, *camera).posed());
+    let framed = |(view, camera): (&View, &Camera)| {
+        let window = Window::framed_in(camera, &view.image);
+        let camera = window.map_or(*camera, |window| window.camera(camera));
+        (window, camera)
+    };
+    let frames: Vec<(Option<Window>, Camera)> = views.iter().zip(&cameras).map(framed).collect();
+    let posed = views.iter().zip(frames).map(|(view, (window, camera))| PosedImage { window, camera, ..view.into() });
     let fits = LeaveOneOut::new(posed.collect::<Vec<_>>(), &config).lift()?;
     // The fits have what they need of the views.
     drop(views);

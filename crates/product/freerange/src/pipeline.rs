@@ -23,7 +23,7 @@ mod watch;
 
 use std::{ops::ControlFlow, path::Path};
 
-pub(crate) use canonical::{CanonicalScene, Photo};
+pub(crate) use canonical::CanonicalScene;
 use freerange_gaussians::Gaussians;
 use freerange_scene::camera::{Similarity, View};
 use freerange_util::Note;

@@ -25,7 +25,7 @@ pub(crate) struct Photo<'v> {
 
 impl<'v> Photo<'v> {
     /// `view`, whose camera in the canonical frame is `camera`.
-    pub fn new(view: &'v View, camera: Camera) -> Self {
+    fn new(view: &'v View, camera: Camera) -> Self {
         let window = Window::framed_in(&camera, &view.image);
         Self { view, window, camera: window.map_or(camera, |window| window.camera(&camera)) }
     }

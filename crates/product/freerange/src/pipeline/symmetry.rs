@@ -15,7 +15,8 @@ use freerange_scene::camera::View;
 use freerange_util::{Note, side_by_side};
 
 use super::{
-    CanonicalScene, Photo,
+    CanonicalScene,
+    canonical::Photo,
     watch::{Watch, flow},
 };
 use crate::{Detect, Error, PipelineConfig, Stage, error::Lift};
