@@ -275,16 +275,13 @@ fn bad_input_is_refused_with_exit_code_2() {
     refused(&["--scenes", &dir, "-o", &out, "--set", "propose.flow.cfg_scale=-1"], &["cfg_scale"]);
     refused(&["compare", &dir, &dir], &["report.json"]);
     // Options without effect.
-    let of_other_objects = [
-        (&["--split", "train"][..], "--data"),
-        (&["--first-seed", "1"], "--generated"),
-        (&["--config", "tiny"], "--generated"),
-        (&["--generated-size", "64"], "--generated"),
-    ];
-    for (option, with) in of_other_objects {
-        refused(&[&["--scenes", &dir, "-o", &out], option].concat(), &[with]);
+    let of_other_objects =
+        [["--split", "train"], ["--first-seed", "1"], ["--config", "tiny"], ["--generated-size", "64"]];
+    for option in of_other_objects {
+        refused(&[&["--scenes", &dir, "-o", &out][..], &option].concat(), &["cannot be used with", option[0]]);
     }
-    refused(&["--generated", "1", "-o", &out, "--full-file", "a.json"], &["--scenes"]);
+    let option = "--full-file";
+    refused(&["--generated", "1", "-o", &out, option, "a.json"], &["cannot be used with", option]);
     for option in [["--seed", "1"], ["--up", "y"]] {
         let white = ["--scenes", &dir, "-o", &out, "--method", "white"];
         refused(&[&white[..], &option].concat(), &[option[0], "--method model"]);

@@ -167,7 +167,7 @@ mod tests {
             chosen.into_iter().for_each(|view| times[view] += 1);
         }
         let [full, quarter, other, none] = times;
-        assert!(none == 0 && full == other, "{times:?}");
+        assert!(none == 0 && other - full <= 1, "{times:?}");
         assert!((f64::from(quarter) / f64::from(full) - 0.25).abs() < 0.03, "{times:?}");
         // Weights of 1 draw nothing: results are those of a program without weights.
         let mut other = rng.clone();

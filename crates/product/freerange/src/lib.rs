@@ -1,5 +1,7 @@
 //! Posed images of an object in, 3D Gaussians out, in the frame of the cameras.
 //!
+//! Architecture invariant: no training, and nothing of the command line.
+//!
 #![cfg_attr(feature = "embedded", doc = "```no_run")]
 #![cfg_attr(not(feature = "embedded"), doc = "```ignore")]
 //! use std::path::Path;

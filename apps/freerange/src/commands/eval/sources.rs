@@ -37,31 +37,31 @@ pub struct SourceArgs {
     #[arg(long, value_name = "N", group = "source")]
     generated: Option<u64>,
     /// File of a scene with the input views from all around.
-    #[arg(long, value_name = "FILE", default_value = "transforms_full.json", requires = "scenes")]
+    #[arg(long, value_name = "FILE", default_value = "transforms_full.json", conflicts_with_all = ["data", "generated"])]
     full_file: String,
     /// File of a scene with the input views from one side.
-    #[arg(long, value_name = "FILE", default_value = "transforms_partial.json", requires = "scenes")]
+    #[arg(long, value_name = "FILE", default_value = "transforms_partial.json", conflicts_with_all = ["data", "generated"])]
     partial_file: String,
     /// File of a scene with the validation views.
-    #[arg(long, value_name = "FILE", default_value = "transforms_val.json", requires = "scenes")]
+    #[arg(long, value_name = "FILE", default_value = "transforms_val.json", conflicts_with_all = ["data", "generated"])]
     validation_file: String,
     /// Folder with the true mesh of each scene, NAME.glb: adds metrics of geometry.
     #[arg(long, value_name = "DIR", requires = "scenes")]
     meshes: Option<PathBuf>,
     /// Split of the shards.
-    #[arg(long, value_enum, default_value = "test", requires = "data")]
+    #[arg(long, value_enum, default_value = "test", conflicts_with_all = ["scenes", "generated"])]
     split: SplitName,
     /// Seed of the first generated object; the default is beyond the seeds of training data.
-    #[arg(long, default_value_t = 7_000_000_000_000, requires = "generated")]
+    #[arg(long, default_value_t = 7_000_000_000_000, conflicts_with_all = ["scenes", "data"])]
     first_seed: u64,
     /// Configuration of generated objects (generator, cameras, views): tiny, base, paper, or a file.
-    #[arg(long, default_value = "tiny", requires = "generated")]
+    #[arg(long, default_value = "tiny", conflicts_with_all = ["scenes", "data"])]
     config: PathBuf,
     /// Width and height of the views of generated objects in pixels [default: the configuration's].
-    #[arg(long, value_name = "PIXELS", requires = "generated", value_parser = clap::value_parser!(u32).range(16..=2048))]
+    #[arg(long, value_name = "PIXELS", conflicts_with_all = ["scenes", "data"], value_parser = clap::value_parser!(u32).range(16..=2048))]
     generated_size: Option<u32>,
     /// Measure the first N objects only.
-    #[arg(long, value_name = "N", requires = "source")]
+    #[arg(long, value_name = "N")]
     limit: Option<usize>,
 }
 
