@@ -44,14 +44,17 @@ pub struct PictureArgs {
 }
 
 impl PictureArgs {
+    /// Refuses objects that no picture shows.
+    pub fn check(&self) -> Result<(), CliError> {
+        match self.picture.is_none() && self.source.given() {
+            true => Err(CliError::input("--scenes, --data and --generated go with --picture only")),
+            false => Ok(()),
+        }
+    }
+
     /// Writes the picture, if one is asked for.
     pub fn run(&self) -> Result<(), CliError> {
-        let (Some(output), Some(runs)) = (&self.picture, &self.runs) else {
-            return match self.source.given() {
-                true => Err(CliError::input("--scenes, --data and --generated go with --picture only")),
-                false => Ok(()),
-            };
-        };
+        let (Some(output), Some(runs)) = (&self.picture, &self.runs) else { return Ok(()) };
         let source = self.source.open()?;
         let chosen: Vec<usize> = match self.objects.as_slice() {
             [] => (0..source.names().len().min(3)).collect(),

@@ -27,6 +27,7 @@ pub struct Args {
 }
 
 pub fn run(args: &Args) -> Result<(), CliError> {
+    args.pictures.check()?;
     let tables = PaperTables::read(&args.rows, args.seed)?;
     if let Some(place) = &args.keep {
         tables.keep(place)?;
