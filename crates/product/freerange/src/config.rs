@@ -44,7 +44,7 @@ pub struct SymmetryConfig {
     /// targets, have half of their weight: all of it up to 0.1 less, none from 0.1 more. 0: none are added.
     pub reflection_threshold: f64,
     /// [Residual](freerange_optim::FoundAxis::contradiction) of an axis at which rotated silhouettes have half of their
-    /// weight, likewise. 0: none are added.
+    /// weight: all of it up to 0.05 less, none from 0.05 more. 0: none are added.
     pub revolution_threshold: f64,
 }
 

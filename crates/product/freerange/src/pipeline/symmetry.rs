@@ -24,18 +24,19 @@ use crate::{Detect, Error, PipelineConfig, Stage, error::Lift};
 /// Photos beyond which no symmetry is looked for: so many were measured, and the network sees at most twice as many.
 const MOST_PHOTOS: usize = 4;
 /// Residuals within which a weight falls from 1 to 0, the threshold in their middle.
-const RAMP: f64 = 0.2;
+const REFLECTION_RAMP: f64 = 0.2;
+const REVOLUTION_RAMP: f64 = 0.1;
 /// The greatest weight of mirrored photos: a photo counts at least twice as much as its mirror image.
 const MIRRORED: f64 = 0.5;
 
 /// The weight of what a symmetry with this residual adds.
-fn weight(residual: f64, threshold: f64) -> f64 {
-    (0.5 + (threshold - residual) / RAMP).clamp(0.0, 1.0)
+fn weight(residual: f64, threshold: f64, ramp: f64) -> f64 {
+    (0.5 + (threshold - residual) / ramp).clamp(0.0, 1.0)
 }
 
 /// The residual from which that is 0.
-fn greatest(threshold: f64) -> f64 {
-    threshold + 0.5 * RAMP
+fn greatest(threshold: f64, ramp: f64) -> f64 {
+    threshold + 0.5 * ramp
 }
 
 /// What one of the searches found.
@@ -90,13 +91,14 @@ pub(crate) fn detect(
     let mut jobs: Vec<(usize, Job<'_>)> = Vec::new();
     if limits.revolution_threshold > 0.0 {
         let find = |tell: &mut Tell<'_>| {
-            find_axis(shown, own, fit, greatest(limits.revolution_threshold), 0, tell).map(Found::Axis)
+            find_axis(shown, own, fit, greatest(limits.revolution_threshold, REVOLUTION_RAMP), 0, tell).map(Found::Axis)
         };
         jobs.push((axis_steps(fit), Box::new(find)));
     }
     if limits.reflection_threshold > 0.0 {
         let find = |tell: &mut Tell<'_>| {
-            find_mirror(shown, own, fit, greatest(limits.reflection_threshold), 0, tell).map(Found::Mirror)
+            find_mirror(shown, own, fit, greatest(limits.reflection_threshold, REFLECTION_RAMP), 0, tell)
+                .map(Found::Mirror)
         };
         jobs.push((mirror_steps(fit), Box::new(find)));
     }
@@ -118,9 +120,9 @@ pub(crate) fn detect(
     }
     watch.report(Stage::Symmetry, [total, total], None, None)?;
     let mut found = Symmetry::default();
-    let weighted = |residual, threshold| Some(weight(residual, threshold)).filter(|weight| *weight > 0.0);
+    let weighted = |residual, threshold, ramp| Some(weight(residual, threshold, ramp)).filter(|weight| *weight > 0.0);
     if let Some(FoundAxis { axis, contradiction }) = axis
-        && let Some(weight) = weighted(contradiction, limits.revolution_threshold)
+        && let Some(weight) = weighted(contradiction, limits.revolution_threshold, REVOLUTION_RAMP)
     {
         let [x, y, z] = axis.direction.to_array();
         found.notes.push(Note::assumed(format!(
@@ -130,7 +132,7 @@ pub(crate) fn detect(
         found.axis = Some((axis, weight));
     }
     if let Some(FoundMirror { mirror, doubt }) = mirror
-        && let Some(weight) = weighted(doubt, limits.reflection_threshold)
+        && let Some(weight) = weighted(doubt, limits.reflection_threshold, REFLECTION_RAMP)
     {
         let weight = MIRRORED * weight;
         let [x, y, z] = mirror.normal.to_array();
@@ -205,10 +207,10 @@ mod tests {
 
     #[test]
     fn a_weight_falls_about_the_threshold() {
-        let weights = [0.5, 1.0, 1.05, 1.1, 1.15, 1.2, 2.0].map(|residual| weight(residual, 1.1));
+        let weights = [0.5, 1.0, 1.05, 1.1, 1.15, 1.2, 2.0].map(|residual| weight(residual, 1.1, 0.2));
         let expected = [1.0, 1.0, 0.75, 0.5, 0.25, 0.0, 0.0];
         assert!(weights.iter().zip(expected).all(|(found, expected)| (found - expected).abs() < 1e-9), "{weights:?}");
-        assert!(weight(greatest(1.1), 1.1).abs() < 1e-9);
+        assert!(weight(greatest(1.1, 0.2), 1.1, 0.2).abs() < 1e-9);
     }
 
     #[test]
