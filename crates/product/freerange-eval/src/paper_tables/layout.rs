@@ -1,0 +1,181 @@
+//! The layout of the tables.
+
+use std::{collections::BTreeMap, path::Path};
+
+use super::{Compared, PARENT, Row, read_row};
+use crate::{
+    EvalError,
+    compare::{Comparison, Paired},
+    paper::{FULL, NUMBER_OF_VIEWS, PARTIAL, thousands},
+    record::{ViewSet, style},
+    report::Group,
+    table::{Cell, Table},
+};
+
+/// Metrics beside PSNR whose differences are shown.
+const FURTHER: [&str; 3] = ["ssim", "lpips-alex", "lpips-vgg"];
+
+fn or_empty(value: Option<String>) -> Cell {
+    Cell::text(value.unwrap_or_default())
+}
+
+/// Table 3: every row's PSNR beside Full's, with the paper's differences.
+pub(super) fn ablations(compared: &Compared<'_>, full: &Row, source: &str) -> Table {
+    let caption = format!(
+        "The paper's Table 3, on {source}: PSNR in dB, difference to Full on the same objects with its 95 % interval, \
+         and the paper's difference on GSO"
+    );
+    let mut table = Table::new(caption, &["row", "parameters", "samples", "hours", "#GS", "s"]);
+    for views in [ViewSet::Full, ViewSet::Partial] {
+        table.head.extend(["PSNR", "difference", "interval", "paper"].map(|c| format!("{views}: {c}")));
+    }
+    for (row, comparisons) in compared {
+        let any = row.group(source, ViewSet::Full).or(row.group(source, ViewSet::Partial));
+        let mut cells = vec![
+            Cell::text(&row.title),
+            or_empty(row.fact("trainable").map(|n| format!("{:.2} M", n / 1e6))),
+            or_empty(row.fact("samples").map(|n| format!("{n:.0}"))),
+            or_empty(row.fact("training_seconds").map(|s| format!("{:.2}", s / 3600.0))),
+            or_empty(any.map(|g| thousands(g.gaussians))),
+            or_empty(any.map(|g| format!("{:.2}", g.seconds))),
+        ];
+        for (i, views) in [ViewSet::Full, ViewSet::Partial].into_iter().enumerate() {
+            let psnr = row.group(source, views).and_then(|g| g.value("psnr"));
+            cells.push(or_empty(psnr.map(|p| format!("{p:.2}"))));
+            let difference = paired(comparisons, views, "psnr").map(|m| m.difference);
+            cells.push(or_empty(difference.map(|d| format!("{:+.2}", d.mean))));
+            cells.push(or_empty(difference.map(|d| format!("{:+.2} to {:+.2}", d.low, d.high))));
+            let paper = row.published.zip(full.published).map(|(own, full)| own[i] - full[i]);
+            cells.push(or_empty(paper.filter(|_| row.key != PARENT).map(|d| format!("{d:+.2}"))));
+        }
+        table.rows.push(cells);
+    }
+    table
+}
+
+/// How a metric of a row differs from Full's.
+fn paired<'a>(comparisons: &'a [Comparison], views: ViewSet, metric: &str) -> Option<&'a Paired> {
+    comparisons.iter().find(|c| c.views == views)?.metrics.iter().find(|m| m.metric == metric)
+}
+
+/// What Table 3 has no room for: differences to Full in SSIM and LPIPS.
+pub(super) fn differences(compared: &Compared<'_>, source: &str) -> Option<Table> {
+    let caption = format!("SSIM and LPIPS on {source}: difference to Full on the same objects with its 95 % interval");
+    let mut table = Table::new(caption, &["row"]);
+    for views in [ViewSet::Full, ViewSet::Partial] {
+        table.head.extend(FURTHER.map(|metric| format!("{views}: {}", style(metric).0)));
+    }
+    for (row, comparisons) in compared.iter().filter(|(row, _)| row.key != PARENT) {
+        let mut cells = vec![Cell::text(&row.title)];
+        for views in [ViewSet::Full, ViewSet::Partial] {
+            cells.extend(FURTHER.map(|metric| or_empty(paired(comparisons, views, metric).map(signed))));
+        }
+        table.rows.push(cells);
+    }
+    (!table.rows.is_empty()).then_some(table)
+}
+
+/// A difference with its interval, in the unit of tables.
+fn signed(paired: &Paired) -> String {
+    let (_, factor, decimals) = style(&paired.metric);
+    let [mean, low, high] = [paired.difference.mean, paired.difference.low, paired.difference.high]
+        .map(|v| format!("{:+.decimals$}", factor * v));
+    format!("{mean} ({low} to {high})")
+}
+
+/// Tables 1 and 2: the methods of the paper, published, and ours below.
+pub(super) fn methods(rows: &[Row], source: &str, views: ViewSet) -> Option<Table> {
+    let keys = [PARENT, "full/four-samples", "no_flow_matching", "pixel_aligned", "voxel_aligned", "pipeline"];
+    let ours: Vec<(&Row, &Group)> = rows
+        .iter()
+        .filter(|r| keys.contains(&r.key.as_str()))
+        .filter_map(|r| Some((r, r.group(source, views)?)))
+        .collect();
+    if ours.is_empty() {
+        return None;
+    }
+    let number = if views == ViewSet::Partial { 1 } else { 2 };
+    let caption =
+        format!("The paper's Table {number}, {views} observation: published numbers are of GSO, ours of {source}");
+    let head = [
+        "method",
+        "#GS",
+        "PSNR",
+        "SSIM x100",
+        "LPIPS (paper's own) x1000",
+        "LPIPS (AlexNet) x1000",
+        "LPIPS (VGG) x1000",
+        "FID",
+        "Frechet (VGG16)",
+        "same, of four samples' mean",
+        "same, unseen views",
+        "unseen, mean",
+    ];
+    let mut table = Table::new(caption, &head);
+    let text = |v: Option<f64>, decimals: usize| or_empty(v.map(|v| format!("{v:.decimals$}")));
+    let mut publish = |name: &str, thousands: u32, [psnr, ssim, lpips, fid]: [Option<f64>; 4]| {
+        let mut row = vec![Cell::text(format!("{name} (published)")), Cell::text(format!("{thousands}K"))];
+        row.extend([text(psnr, 2), text(ssim, 2), text(lpips, 1), Cell::default(), Cell::default(), text(fid, 2)]);
+        row.resize(head.len(), Cell::default());
+        table.rows.push(row);
+    };
+    match views {
+        ViewSet::Partial => {
+            PARTIAL.iter().for_each(|(n, k, _, g)| publish(n, *k, [Some(g[0]), None, None, Some(g[3])]))
+        }
+        ViewSet::Full => {
+            FULL.iter().for_each(|(n, k, _, g)| publish(n, *k, [Some(g[0]), Some(g[1]), Some(g[2]), None]))
+        }
+    }
+    for (row, group) in ours {
+        let value =
+            |metric: &str, factor: f64, decimals: usize| text(group.value(metric).map(|v| factor * v), decimals);
+        let frechet = group.frechet_vgg;
+        let mut cells = vec![
+            Cell::text(&row.title),
+            Cell::text(thousands(group.gaussians)),
+            value("psnr", 1.0, 2),
+            value("ssim", 100.0, 2),
+            Cell::default(),
+            value("lpips-alex", 1000.0, 1),
+            value("lpips-vgg", 1000.0, 1),
+            value("fid", 1.0, 2),
+        ];
+        cells.extend([
+            text(frechet.map(|f| f.sample), 2),
+            text(frechet.and_then(|f| f.mean), 2),
+            text(frechet.and_then(|f| f.unseen_sample), 2),
+            text(frechet.and_then(|f| f.unseen_mean), 2),
+        ]);
+        table.rows.push(cells.into_iter().map(Cell::strong).collect());
+    }
+    Some(table)
+}
+
+/// Table 4: numbers of input views, full observation.
+pub(super) fn views(place: &Path) -> Result<Option<Table>, EvalError> {
+    let mut table = Table::new(
+        "The paper's Table 4: Full by its number of input views, full observation, PSNR in dB",
+        &["input views", "paper (GSO)"],
+    );
+    let mut rows: BTreeMap<String, Vec<Option<f64>>> = BTreeMap::new();
+    for (i, (count, _)) in NUMBER_OF_VIEWS.iter().enumerate() {
+        let key = if *count == 4 { PARENT.to_owned() } else { format!("{PARENT}/inputs-{count}") };
+        for (source, report) in read_row(place, &key, "", None)?.reports {
+            let psnr = report.groups.iter().find(|g| g.views == ViewSet::Full && g.inputs == *count);
+            let own = rows.entry(source).or_insert_with(|| vec![None; NUMBER_OF_VIEWS.len()]);
+            own[i] = psnr.and_then(|g| g.value("psnr"));
+        }
+    }
+    rows.retain(|_, values| values.iter().flatten().count() > 1);
+    if rows.is_empty() {
+        return Ok(None);
+    }
+    table.head.extend(rows.keys().cloned());
+    for (i, (count, paper)) in NUMBER_OF_VIEWS.iter().enumerate() {
+        let mut cells = vec![Cell::text(count), Cell::text(format!("{paper:.2}"))];
+        cells.extend(rows.values().map(|own| or_empty(own[i].map(|p| format!("{p:.2}")))));
+        table.rows.push(cells);
+    }
+    Ok(Some(table))
+}
