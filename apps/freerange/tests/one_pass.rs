@@ -62,6 +62,10 @@ fn a_pixel_aligned_model_goes_through_every_command() {
         (["--set", "propose.flow.cfg_scale=2"], "propose.flow.cfg_scale"),
         (["--set", "propose.flow.lambda_pg=1"], "propose.flow.lambda_pg"),
         (["--set", "propose.flow.lod_depth=8"], "propose.flow.lod_depth"),
+        (["--set", "propose.flow.gradient_at=estimate"], "propose.flow.gradient_at"),
+        (["--set", "propose.flow.gradient_size=64"], "propose.flow.gradient_size"),
+        (["--set", "propose.flow.background=white"], "propose.flow.background"),
+        (["--set", "propose.flow.coupling=tree"], "propose.flow.coupling"),
         (["--samples", "2"], "seeds"),
     ] {
         let refused = with(&option);
@@ -74,7 +78,7 @@ fn a_pixel_aligned_model_goes_through_every_command() {
         let refused = with(&option);
         assert_eq!(refused.status.code(), Some(2), "{option:?}: {}", String::from_utf8_lossy(&refused.stderr));
     }
-    let made = with(&["--iterations", "3"]);
+    let made = with(&["--iterations", "3", "--set", "propose.flow.coupling=independent"]); // the model's own
     assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
     let report: serde_json::Value = serde_json::from_slice(&std::fs::read(out.join("report.json")).unwrap()).unwrap();
     assert!(report["gaussians"].as_u64().unwrap() >= 2 * 16 * 16, "two views, one Gaussian per pixel: {report}");

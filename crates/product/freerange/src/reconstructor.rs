@@ -105,7 +105,8 @@ impl Reconstructor {
         let config = &options.pipeline;
         config.validate()?;
         let kind = self.checkpoint.config.kind;
-        config.propose.flow.validate_for(kind).map_err(|e| e.within("propose.flow").lift())?;
+        let own = Settings::of(&self.checkpoint.provenance).lift()?;
+        config.propose.flow.validate_for(kind, &own.sample).map_err(|e| e.within("propose.flow").lift())?;
         let sampled = config.propose.init == Init::Flow && options.init.is_none();
         let only = |ok: bool, field: &str, expected: &str, found: String| {
             let expected = format!("{expected}: a {} model predicts in one pass", kind.name());
@@ -124,7 +125,6 @@ impl Reconstructor {
         if options.without_network && sampled {
             return Err(Error::input("propose.init", "fit where the network is left out", "flow"));
         }
-        let own = Settings::of(&self.checkpoint.provenance).lift()?;
         if config.refine.is_some() && own.refiner.is_none() {
             return Err(Error::input("refine", "none: the model was not trained to refine", "some"));
         }

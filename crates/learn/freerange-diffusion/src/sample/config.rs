@@ -108,11 +108,11 @@ impl FlowConfig {
     }
 
     /// Refuses settings without effect on a model of this kind: one that predicts in one pass has no noise to begin with, no
-    /// steps and no guidance.
+    /// steps, no guidance and no gradients. `own` are the model's settings, which name a value for each all the same.
     ///
     /// # Errors
     /// Names the setting.
-    pub fn validate_for(&self, kind: ModelKind) -> Result<(), Invalid> {
+    pub fn validate_for(&self, kind: ModelKind, own: &Self) -> Result<(), Invalid> {
         if !kind.one_pass() {
             return Ok(());
         }
@@ -123,7 +123,20 @@ impl FlowConfig {
         only(self.steps == 1, "steps", "1", self.steps.to_string())?;
         only(self.cfg_scale == 1.0, "cfg_scale", "1", self.cfg_scale.to_string())?;
         only(self.lambda_pg == 0.0, "lambda_pg", "0", self.lambda_pg.to_string())?;
-        only(self.lod_depth.is_none(), "lod_depth", "none", format!("{:?}", self.lod_depth))
+        only(self.lod_depth.is_none(), "lod_depth", "none", format!("{:?}", self.lod_depth))?;
+        let gradients = |c: &Self| {
+            [
+                ("gradient_at", format!("{:?}", c.gradient_at)),
+                ("gradient_size", c.gradient_size.to_string()),
+                ("background", format!("{:?}", c.background)),
+                ("coupling", format!("{:?}", c.coupling)),
+            ]
+            .map(|(field, value)| (field, value.to_lowercase()))
+        };
+        for ((field, found), (_, expected)) in gradients(self).into_iter().zip(gradients(own)) {
+            only(found == expected, field, &format!("the model's own, {expected},"), found)?;
+        }
+        Ok(())
     }
 }
 

@@ -44,7 +44,10 @@ impl FlowSampler<'_> {
         mut progress: impl FnMut(&Estimate<'_>) -> ControlFlow<()>,
     ) -> Result<Vec<Gaussians>, FlowError> {
         let &Self { checkpoint, config, device } = self;
-        config.validate().and_then(|()| config.validate_for(checkpoint.config.kind)).map_err(|e| e.within("sample"))?;
+        config
+            .validate()
+            .and_then(|()| config.validate_for(checkpoint.config.kind, config))
+            .map_err(|e| e.within("sample"))?;
         if objects.is_empty() || seeds.is_empty() {
             return Ok(Vec::new());
         }

@@ -121,7 +121,7 @@ impl<M: Making> TrainConfig<M> {
     /// Refuses losses and sampling that a model of this kind does not have.
     fn validate_kind(&self) -> Result<(), TrainError> {
         let (kind, l) = (self.model.kind, &self.loss);
-        self.sample.validate_for(kind).map_err(|e| e.within("sample"))?;
+        self.sample.validate_for(kind, &self.sample).map_err(|e| e.within("sample"))?;
         if !kind.one_pass() {
             return Ok(());
         }
