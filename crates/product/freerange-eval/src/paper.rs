@@ -13,6 +13,9 @@ use crate::{
 /// A method's row: name, thousands of Gaussians, values on Objaverse, values on GSO.
 type Row<const N: usize> = (&'static str, u32, [f64; N], [f64; N]);
 
+/// Objects of Google Scanned Objects in the paper.
+pub const GSO: usize = 1030;
+
 /// Table 1, partial observation: PSNR, DINO x100, DreamSim x100, FID.
 pub const PARTIAL: [Row<4>; 5] = [
     ("ReconViaGen", 500, [21.33, 68.71, 18.21, 66.07], [17.67, 68.04, 24.35, 23.32]),

@@ -6,7 +6,7 @@ use super::{Compared, PARENT, Row, read_row};
 use crate::{
     EvalError,
     compare::{Comparison, Paired},
-    paper::{FULL, NUMBER_OF_VIEWS, PARTIAL, thousands},
+    paper::{FULL, GSO, NUMBER_OF_VIEWS, PARTIAL, thousands},
     record::{ViewSet, style},
     report::Group,
     table::{Cell, Table},
@@ -27,7 +27,7 @@ pub(super) fn ablations(compared: &Compared<'_>, full: &Row, source: &str) -> Ta
     );
     let mut table = Table::new(caption, &["row", "parameters", "samples", "hours", "#GS", "s"]);
     for views in [ViewSet::Full, ViewSet::Partial] {
-        table.head.extend(["PSNR", "difference", "interval", "paper"].map(|c| format!("{views}: {c}")));
+        table.head.extend(["objects", "PSNR", "difference", "interval", "paper"].map(|c| format!("{views}: {c}")));
     }
     for (row, comparisons) in compared {
         let any = row.group(source, ViewSet::Full).or(row.group(source, ViewSet::Partial));
@@ -40,7 +40,9 @@ pub(super) fn ablations(compared: &Compared<'_>, full: &Row, source: &str) -> Ta
             or_empty(any.map(|g| format!("{:.2}", g.seconds))),
         ];
         for (i, views) in [ViewSet::Full, ViewSet::Partial].into_iter().enumerate() {
-            let psnr = row.group(source, views).and_then(|g| g.value("psnr"));
+            let group = row.group(source, views);
+            cells.push(or_empty(group.map(|g| g.measured.to_string())));
+            let psnr = group.and_then(|g| g.value("psnr"));
             cells.push(or_empty(psnr.map(|p| format!("{p:.2}"))));
             let difference = paired(comparisons, views, "psnr").map(|m| m.difference);
             cells.push(or_empty(difference.map(|d| format!("{:+.2}", d.mean))));
@@ -63,11 +65,14 @@ pub(super) fn differences(compared: &Compared<'_>, source: &str) -> Option<Table
     let caption = format!("SSIM and LPIPS on {source}: difference to Full on the same objects with its 95 % interval");
     let mut table = Table::new(caption, &["row"]);
     for views in [ViewSet::Full, ViewSet::Partial] {
+        table.head.push(format!("{views}: objects"));
         table.head.extend(FURTHER.map(|metric| format!("{views}: {}", style(metric).0)));
     }
     for (row, comparisons) in compared.iter().filter(|(row, _)| row.key != PARENT) {
         let mut cells = vec![Cell::text(&row.title)];
         for views in [ViewSet::Full, ViewSet::Partial] {
+            let objects = comparisons.iter().find(|c| c.views == views).map(|c| c.objects.to_string());
+            cells.push(or_empty(objects));
             cells.extend(FURTHER.map(|metric| or_empty(paired(comparisons, views, metric).map(signed))));
         }
         table.rows.push(cells);
@@ -100,6 +105,7 @@ pub(super) fn methods(rows: &[Row], source: &str, views: ViewSet) -> Option<Tabl
     let head = [
         "method",
         "#GS",
+        "objects",
         "PSNR",
         "SSIM x100",
         "LPIPS (paper's own) x1000",
@@ -110,11 +116,13 @@ pub(super) fn methods(rows: &[Row], source: &str, views: ViewSet) -> Option<Tabl
         "same, of four samples' mean",
         "same, unseen views",
         "unseen, mean",
+        "unseen images",
     ];
     let mut table = Table::new(caption, &head);
     let text = |v: Option<f64>, decimals: usize| or_empty(v.map(|v| format!("{v:.decimals$}")));
     let mut publish = |name: &str, thousands: u32, [psnr, ssim, lpips, fid]: [Option<f64>; 4]| {
-        let mut row = vec![Cell::text(format!("{name} (published)")), Cell::text(format!("{thousands}K"))];
+        let mut row =
+            vec![Cell::text(format!("{name} (published)")), Cell::text(format!("{thousands}K")), Cell::text(GSO)];
         row.extend([text(psnr, 2), text(ssim, 2), text(lpips, 1), Cell::default(), Cell::default(), text(fid, 2)]);
         row.resize(head.len(), Cell::default());
         table.rows.push(row);
@@ -134,6 +142,7 @@ pub(super) fn methods(rows: &[Row], source: &str, views: ViewSet) -> Option<Tabl
         let mut cells = vec![
             Cell::text(&row.title),
             Cell::text(thousands(group.gaussians)),
+            Cell::text(group.measured),
             value("psnr", 1.0, 2),
             value("ssim", 100.0, 2),
             Cell::default(),
@@ -146,6 +155,7 @@ pub(super) fn methods(rows: &[Row], source: &str, views: ViewSet) -> Option<Tabl
             text(frechet.and_then(|f| f.mean), 2),
             text(frechet.and_then(|f| f.unseen_sample), 2),
             text(frechet.and_then(|f| f.unseen_mean), 2),
+            or_empty(frechet.map(|f| f.unseen_images.to_string())),
         ]);
         table.rows.push(cells.into_iter().map(Cell::strong).collect());
     }
