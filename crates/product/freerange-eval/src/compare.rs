@@ -49,6 +49,13 @@ pub struct Paired {
     pub equal: usize,
 }
 
+impl Paired {
+    /// Objects that are compared.
+    pub fn objects(&self) -> usize {
+        self.better + self.worse + self.equal
+    }
+}
+
 type Key = (ViewSet, usize, String);
 
 /// Compares two reports. Cases are paired by object, view set and number of inputs; where each report has but one number

@@ -26,6 +26,8 @@ use crate::{
 
 /// The row that all others are compared with.
 pub const PARENT: &str = "full";
+/// Input views of all rows but those of other numbers of views.
+const INPUTS: usize = 4;
 /// The file of [claims](PaperTables::keep).
 const CLAIMS: &str = "claims.json";
 
@@ -107,11 +109,11 @@ impl PaperTables {
             tables.extend(layout::methods(&rows, source, ViewSet::Full));
             claims.extend(claims::claims(&rows, full, source, &kept, seed)?);
         }
-        tables.extend(layout::views(place)?);
+        tables.extend(layout::views(place, full, seed)?);
         if !claims.is_empty() {
             tables.insert(0, claims::table(&claims));
         }
-        for count in NUMBER_OF_VIEWS.map(|(count, _)| count).into_iter().filter(|count| *count != 4) {
+        for count in NUMBER_OF_VIEWS.map(|(count, _)| count).into_iter().filter(|count| *count != INPUTS) {
             rows.push(read_row(place, &format!("{PARENT}/inputs-{count}"), "", None)?);
         }
         Ok(Self { tables, claims, missing, rows })

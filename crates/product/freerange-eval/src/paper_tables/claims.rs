@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use super::Row;
+use super::{INPUTS, Row};
 use crate::{
     EvalError,
     record::ViewSet,
@@ -77,17 +77,20 @@ pub(super) fn table(claims: &[Claim]) -> Table {
     table
 }
 
-/// PSNR of each object, of a view set.
-fn psnr_by_object(row: &Row, source: &str, views: ViewSet) -> BTreeMap<String, f64> {
+/// PSNR of each object.
+pub(super) type PsnrByObject = BTreeMap<String, f64>;
+
+/// PSNR of each object, of a view set and a number of input views.
+pub(super) fn psnr_by_object(row: &Row, source: &str, views: ViewSet, inputs: usize) -> PsnrByObject {
     let Some(report) = row.reports.get(source) else { return BTreeMap::new() };
-    let own = report.measured().filter(|(case, _)| case.views == views);
+    let own = report.measured().filter(|(case, _)| (case.views, case.inputs) == (views, inputs));
     own.filter_map(|(case, m)| Some((case.object.clone(), *m.metrics.get("psnr")?))).collect()
 }
 
 /// The claims that PSNR answers: what partial observation costs, and what flow matching is worth.
 fn psnr_claims(rows: &[Row], full: &Row, source: &str, seed: u64) -> Vec<Claim> {
     let find = |key: &str| rows.iter().find(|r| r.key == key);
-    let of = |row: &Row, views| psnr_by_object(row, source, views);
+    let of = |row: &Row, views| psnr_by_object(row, source, views, INPUTS);
     let mut out = Vec::new();
     let mut add = |claim: &str, differences: Vec<f64>| {
         if let Some(difference) = bootstrap(&differences, seed) {
@@ -95,7 +98,7 @@ fn psnr_claims(rows: &[Row], full: &Row, source: &str, seed: u64) -> Vec<Claim> 
         }
     };
     if let Some(pixel) = find("pixel_aligned") {
-        let lost = |row: &Row| -> BTreeMap<String, f64> {
+        let lost = |row: &Row| -> PsnrByObject {
             let partial = of(row, ViewSet::Partial);
             let both = of(row, ViewSet::Full).into_iter();
             both.filter_map(|(object, full)| Some((object.clone(), full - partial.get(&object)?))).collect()

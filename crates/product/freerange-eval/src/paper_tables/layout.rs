@@ -2,13 +2,18 @@
 
 use std::{collections::BTreeMap, path::Path};
 
-use super::{Compared, PARENT, Row, read_row};
+use super::{
+    Compared, INPUTS, PARENT, Row,
+    claims::{PsnrByObject, psnr_by_object},
+    read_row,
+};
 use crate::{
     EvalError,
-    compare::{Comparison, Paired},
+    compare::{Comparison, Paired, compare},
     paper::{FULL, GSO, NUMBER_OF_VIEWS, PARTIAL, thousands},
     record::{ViewSet, style},
     report::Group,
+    statistics::{bootstrap, mean},
     table::{Cell, Table},
 };
 
@@ -22,8 +27,8 @@ fn or_empty(value: Option<String>) -> Cell {
 /// Table 3: every row's PSNR beside Full's, with the paper's differences.
 pub(super) fn ablations(compared: &Compared<'_>, full: &Row, source: &str) -> Table {
     let caption = format!(
-        "The paper's Table 3, on {source}: PSNR in dB, difference to Full on the same objects with its 95 % interval, \
-         and the paper's difference on GSO"
+        "The paper's Table 3, on {source}: PSNR in dB of the objects that a row shares with Full, difference to Full on \
+         these with its 95 % interval, and the paper's difference on GSO"
     );
     let mut table = Table::new(caption, &["row", "parameters", "samples", "hours", "#GS", "s"]);
     for views in [ViewSet::Full, ViewSet::Partial] {
@@ -40,11 +45,13 @@ pub(super) fn ablations(compared: &Compared<'_>, full: &Row, source: &str) -> Ta
             or_empty(any.map(|g| format!("{:.2}", g.seconds))),
         ];
         for (i, views) in [ViewSet::Full, ViewSet::Partial].into_iter().enumerate() {
-            let group = row.group(source, views);
-            cells.push(or_empty(group.map(|g| g.measured.to_string())));
-            let psnr = group.and_then(|g| g.value("psnr"));
+            let paired = paired(comparisons, views, "psnr");
+            let own = row.group(source, views).filter(|_| row.key == PARENT);
+            let objects = paired.map(Paired::objects).or(own.map(|g| g.measured));
+            cells.push(or_empty(objects.map(|n| n.to_string())));
+            let psnr = paired.map(|p| p.b).or(own.and_then(|g| g.value("psnr")));
             cells.push(or_empty(psnr.map(|p| format!("{p:.2}"))));
-            let difference = paired(comparisons, views, "psnr").map(|m| m.difference);
+            let difference = paired.map(|p| p.difference);
             cells.push(or_empty(difference.map(|d| format!("{:+.2}", d.mean))));
             cells.push(or_empty(difference.map(|d| format!("{:+.2} to {:+.2}", d.low, d.high))));
             let paper = row.published.zip(full.published).map(|(own, full)| own[i] - full[i]);
@@ -162,30 +169,49 @@ pub(super) fn methods(rows: &[Row], source: &str, views: ViewSet) -> Option<Tabl
     Some(table)
 }
 
-/// Table 4: numbers of input views, full observation.
-pub(super) fn views(place: &Path) -> Result<Option<Table>, EvalError> {
-    let mut table = Table::new(
-        "The paper's Table 4: Full by its number of input views, full observation, PSNR in dB",
-        &["input views", "paper (GSO)"],
-    );
-    let mut rows: BTreeMap<String, Vec<Option<f64>>> = BTreeMap::new();
-    for (i, (count, _)) in NUMBER_OF_VIEWS.iter().enumerate() {
-        let key = if *count == 4 { PARENT.to_owned() } else { format!("{PARENT}/inputs-{count}") };
-        for (source, report) in read_row(place, &key, "", None)?.reports {
-            let psnr = report.groups.iter().find(|g| g.views == ViewSet::Full && g.inputs == *count);
-            let own = rows.entry(source).or_insert_with(|| vec![None; NUMBER_OF_VIEWS.len()]);
-            own[i] = psnr.and_then(|g| g.value("psnr"));
+/// Table 4: numbers of input views, full observation, on the objects that all of them have; one table for each source.
+pub(super) fn views(place: &Path, full: &Row, seed: u64) -> Result<Vec<Table>, EvalError> {
+    let mut sources: BTreeMap<String, BTreeMap<usize, PsnrByObject>> = BTreeMap::new();
+    for (count, _) in NUMBER_OF_VIEWS {
+        let key = if count == INPUTS { PARENT.to_owned() } else { format!("{PARENT}/inputs-{count}") };
+        let row = read_row(place, &key, "", None)?;
+        for (source, report) in &row.reports {
+            if let Some(full) = full.reports.get(source).filter(|_| count != INPUTS) {
+                compare(full, report, seed)?; // or the images differ
+            }
+            let psnr = psnr_by_object(&row, source, ViewSet::Full, count);
+            if !psnr.is_empty() {
+                sources.entry(source.clone()).or_default().insert(count, psnr);
+            }
         }
     }
-    rows.retain(|_, values| values.iter().flatten().count() > 1);
-    if rows.is_empty() {
-        return Ok(None);
+    Ok(sources.iter().filter(|(_, rows)| rows.len() > 1).map(|(source, rows)| by_views(source, rows, seed)).collect())
+}
+
+fn by_views(source: &str, rows: &BTreeMap<usize, PsnrByObject>, seed: u64) -> Table {
+    let any = rows.values().next().into_iter().flat_map(BTreeMap::keys);
+    let common: Vec<&String> = any.filter(|object| rows.values().all(|row| row.contains_key(*object))).collect();
+    let caption = format!(
+        "The paper's Table 4, on {source}: Full by its number of input views, full observation, on the {} objects that all \
+         of these have; PSNR in dB, and the difference to {INPUTS} views with its 95 % interval",
+        common.len()
+    );
+    let head = ["input views", "PSNR", "difference", "interval", "paper (GSO)", "paper: difference"];
+    let mut table = Table::new(caption, &head);
+    let (_, of_four) = NUMBER_OF_VIEWS[1];
+    for (count, paper) in NUMBER_OF_VIEWS {
+        let psnr = rows.get(&count).map(|row| common.iter().map(|object| row[*object]).collect::<Vec<f64>>());
+        let four = rows.get(&INPUTS).filter(|_| count != INPUTS);
+        let differences = psnr.iter().flatten().zip(&common).filter_map(|(psnr, object)| Some(psnr - four?[*object]));
+        let difference = bootstrap(&differences.collect::<Vec<f64>>(), seed);
+        table.rows.push(vec![
+            Cell::text(count),
+            or_empty(psnr.and_then(|psnr| mean(&psnr)).map(|p| format!("{p:.2}"))),
+            or_empty(difference.map(|d| format!("{:+.2}", d.mean))),
+            or_empty(difference.map(|d| format!("{:+.2} to {:+.2}", d.low, d.high))),
+            Cell::text(format!("{paper:.2}")),
+            or_empty((count != INPUTS).then(|| format!("{:+.2}", paper - of_four))),
+        ]);
     }
-    table.head.extend(rows.keys().cloned());
-    for (i, (count, paper)) in NUMBER_OF_VIEWS.iter().enumerate() {
-        let mut cells = vec![Cell::text(count), Cell::text(format!("{paper:.2}"))];
-        cells.extend(rows.values().map(|own| or_empty(own[i].map(|p| format!("{p:.2}")))));
-        table.rows.push(cells);
-    }
-    Ok(Some(table))
+    table
 }
