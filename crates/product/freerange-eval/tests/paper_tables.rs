@@ -77,6 +77,10 @@ fn rows_stand_beside_the_papers_numbers_and_claims_are_answered() {
     assert!((lost.mean - 3.0).abs() < 1e-9 && lost.low <= lost.mean && lost.mean <= lost.high, "{lost:?}");
     assert!(found.missing.iter().any(|m| m == "Random patching") && !found.missing.iter().any(|m| m == "Full"));
 
+    let missing = |row: &str| found.missing.iter().any(|m| m == row);
+    assert!(missing("Full, 6 input views (test time)") && !missing("Full, 2 input views (test time)"));
+    assert!(missing("every row on the 21 objects"));
+
     let text = found.markdown();
     for line in [
         "| Full | 7.43 M | 40000 | 1.00 | 1.0K | 2.00 | 12 | 25.00 |  |  |  | 12 | 23.00 |  |  |  |",
@@ -102,6 +106,20 @@ fn rows_stand_beside_the_papers_numbers_and_claims_are_answered() {
     let kept = tempfile::tempdir().unwrap();
     found.keep(kept.path()).unwrap();
     assert_eq!(PaperTables::read(kept.path(), 0).unwrap().markdown(), text);
+}
+
+#[test]
+fn rows_without_the_21_objects_are_named() {
+    let place = tempfile::tempdir().unwrap();
+    let row = |name: &str| place.path().join(name);
+    for name in ["full/objects", "full/generated", "full/four-samples/generated", "no_curriculum/generated"] {
+        evaluation(&row(name), 2, [20.0, 20.0], 4, 0.0);
+    }
+    let missing = PaperTables::read(place.path(), 0).unwrap().missing;
+    assert_eq!(missing.last().unwrap(), "on the 21 objects No LoD curriculum");
+    evaluation(&row("no_curriculum/objects"), 2, [20.0, 20.0], 4, 0.0);
+    let missing = PaperTables::read(place.path(), 0).unwrap().missing;
+    assert!(!missing.iter().any(|m| m.contains("21 objects")), "{missing:?}");
 }
 
 #[test]

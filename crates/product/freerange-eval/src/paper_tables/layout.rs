@@ -3,7 +3,7 @@
 use std::{collections::BTreeMap, path::Path};
 
 use super::{
-    Compared, INPUTS, PARENT, Row,
+    Compared, FOUR_SAMPLES, INPUTS, PARENT, Row,
     claims::{PsnrByObject, psnr_by_object},
     read_row,
 };
@@ -97,7 +97,7 @@ fn signed(paired: &Paired) -> String {
 
 /// Tables 1 and 2: the methods of the paper, published, and ours below.
 pub(super) fn methods(rows: &[Row], source: &str, views: ViewSet) -> Option<Table> {
-    let keys = [PARENT, "full/four-samples", "no_flow_matching", "pixel_aligned", "voxel_aligned", "pipeline"];
+    let keys = [PARENT, FOUR_SAMPLES, "no_flow_matching", "pixel_aligned", "voxel_aligned", "pipeline"];
     let ours: Vec<(&Row, &Group)> = rows
         .iter()
         .filter(|r| keys.contains(&r.key.as_str()))
