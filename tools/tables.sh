@@ -5,8 +5,10 @@
 #
 # BINARY is a release build of freerange with the feature `networks`. PLACE gets objects, runs and evaluations: a folder
 # outside of the checkout, with 4 GB to spare. Whatever is there already is continued, to the bit as if never stopped: run
-# the same command again after a kill. Without ROW all of them, in the order of the tables. Then what the tables are made
-# of goes to docs/results/paper-tables/ and the tables to docs/results/paper-tables/tables.md.
+# the same command again after a kill. Without ROW all of them, in the order of the tables. After each row what the tables
+# are made of goes to docs/results/paper-tables/ and the tables to docs/results/paper-tables/tables.md. A row that has no
+# evaluation in PLACE is the one that docs/results/paper-tables/ has, if any. An evaluation that has a report but not its
+# settings, such as a copy of a kept one, begins again. Exit status 1: the tables could not be written after some row.
 #
 # FREERANGE_SHARED names the folder of the 21 objects (../shared); without it they are left out, with a line that says so.
 # WEIGHTS names the folder of LPIPS's weights (tools/lpips_weights.py makes it); without it LPIPS and the Frechet distance
@@ -26,7 +28,9 @@ rows=("$@")
 objects=${OBJECTS:-3072} generated=${GENERATED:-100} part=${PART:-1}
 shared=${FREERANGE_SHARED:-../shared}
 
-mkdir -p "$place/rows" "$place/runs"
+kept=docs/results/paper-tables failed=0
+
+mkdir -p "$place/rows" "$place/runs" "$kept"
 mkdir -p "$place/configs/tables" && cp configs/tables/*.toml "$place/configs/tables/"
 if [ "$part" != 1 ]; then
   python3 - "$part" "$place"/configs/tables/*.toml <<'PYTHON'
@@ -46,20 +50,39 @@ echo "== objects"
 
 # evaluate CHECKPOINT FOLDER SOURCE OPTION...: without CHECKPOINT the shipped pipeline. SOURCE is a number of generated objects, or `objects`, the 21.
 evaluate() {
-  local checkpoint=$1 folder=$2 source=$3 from
+  local checkpoint=$1 folder=$2 source=$3 from to
   shift 3
   if [ "$source" = objects ]; then
     if [ ! -d "$shared/views" ]; then
       echo "== LEFT OUT: the 21 objects ($shared/views is not there)"
       return
     fi
-    from=(--scenes "$shared/views" -o "$folder/objects")
+    to=$folder/objects from=(--scenes "$shared/views")
   else
-    from=(--generated "$source" --generated-size 256 -o "$folder/generated")
+    to=$folder/generated from=(--generated "$source" --generated-size 256)
+  fi
+  if [ -f "$to/report.json" ] && [ ! -f "$to/settings.json" ]; then
+    echo "== again: $to has a report without settings"
+    rm -r "$to"
   fi
   [ -z "${WEIGHTS:-}" ] || from+=(--weights "$WEIGHTS")
   [ -z "$checkpoint" ] || from+=(--checkpoint "$checkpoint")
-  "$binary" eval --pictures none "${from[@]}" "$@"
+  "$binary" eval --pictures none "${from[@]}" -o "$to" "$@"
+}
+
+# tables ROW: the tables so far, of PLACE/tables: links to the rows of PLACE, and to kept ones where PLACE has none.
+tables() {
+  local all=$place/tables row
+  rm -rf "$all"
+  mkdir "$all"
+  for row in "$kept"/*/ "$place"/rows/*/; do
+    if compgen -G "$row*/report.json" >/dev/null; then ln -sfn "$(realpath "$row")" "$all/$(basename "$row")"; fi
+  done
+  if [ -f "$kept/claims.json" ]; then ln -s "$PWD/$kept/claims.json" "$all/"; fi
+  if ! "$binary" eval paper-tables "$all" --keep "$kept" -o "$kept/tables.md"; then
+    echo "== FAILED: the tables after $1"
+    failed=1
+  fi
 }
 
 # Full's checkpoint at other settings, on half of the objects: differences are paired.
@@ -80,7 +103,7 @@ for row in "${rows[@]}"; do
   echo "== $row"
   if [ "$row" = test_time ]; then
     test_time
-    "$binary" eval paper-tables "$place/rows" --keep docs/results/paper-tables -o docs/results/paper-tables/tables.md
+    tables "$row"
     continue
   fi
   run=$place/runs/$row out=$place/rows/$row checkpoint=$place/runs/$row/checkpoint.safetensors
@@ -97,5 +120,6 @@ for row in "${rows[@]}"; do
   for source in "$generated" objects; do
     evaluate "$checkpoint" "$out" "$source" --metrics "$metrics"
   done
-  "$binary" eval paper-tables "$place/rows" --keep docs/results/paper-tables -o docs/results/paper-tables/tables.md
+  tables "$row"
 done
+exit "$failed"

@@ -175,6 +175,17 @@ impl RunFolder {
         self.numbers(case, VGG, count)
     }
 
+    /// Writes features of VGG16 without the case.
+    ///
+    /// # Errors
+    /// [`EvalError::Io`].
+    pub fn write_vgg_features(&self, case: &Case, values: &[f32]) -> Result<(), EvalError> {
+        let objects = self.path.join(OBJECTS);
+        fs::create_dir_all(&objects).map_err(IoError::at(&objects))?;
+        let bytes: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
+        write(&self.file(case, VGG), &bytes)
+    }
+
     /// Whether features of VGG16 were written with a case.
     pub fn has_vgg_features(&self, case: &Case) -> bool {
         self.file(case, VGG).is_file()

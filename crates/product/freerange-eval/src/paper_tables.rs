@@ -1,8 +1,8 @@
 //! The paper's four tables with rows trained at our size beside its own numbers, from the evaluations of every row.
 //!
 //! Input is a folder per row: `SOURCE/report.json` for each source of objects that it was evaluated on, `inputs-N/SOURCE`
-//! for other numbers of input views, `no-cfg/SOURCE` and `no-photometric/SOURCE` for the two test-time rows, and
-//! `model.json` (what `model info --json` prints of its checkpoint). Every difference is to the row `full`, paired by object.
+//! for other numbers of input views, `no-cfg/SOURCE` and `no-photometric/SOURCE` for the two test-time rows,
+//! `model.json` (what `model info --json` prints of its checkpoint), and `log.jsonl` of its training. Every difference is to the row `full`, paired by object.
 
 mod claims;
 mod layout;
@@ -32,6 +32,8 @@ const FOUR_SAMPLES: &str = "full/four-samples";
 const OBJECTS: &str = "objects";
 /// Input views of all rows but those of other numbers of views.
 const INPUTS: usize = 4;
+/// The file of a training's losses.
+const LOG: &str = "log.jsonl";
 /// The file of [claims](PaperTables::keep).
 const CLAIMS: &str = "claims.json";
 
@@ -68,6 +70,8 @@ struct Row {
     reports: BTreeMap<String, Report>,
     folders: BTreeMap<String, RunFolder>,
     model: Option<Value>,
+    /// Of the training.
+    log: Option<String>,
 }
 
 /// The tables and the claims.
@@ -128,7 +132,8 @@ impl PaperTables {
     }
 
     /// Writes what the tables are made of to `place`, from where they can be made again: every report without the scores of
-    /// single views, what is known of checkpoints, and the claims, one of which rests on features that are not kept.
+    /// single views, the features that a claim rests on, what is known of checkpoints, every tenth step of their training,
+    /// and the claims. `place` may be where the rows were read from.
     ///
     /// # Errors
     /// [`EvalError::Io`].
@@ -137,10 +142,20 @@ impl PaperTables {
             for (source, report) in &row.reports {
                 let folder = place.join(&row.key).join(source);
                 std::fs::create_dir_all(&folder).map_err(IoError::at(&folder))?;
-                RunFolder::existing(&folder).write_json("report.json", &report.without_views())?;
+                let to = RunFolder::existing(&folder);
+                let mut report = report.without_views();
+                claims::keep_features(row, source, &mut report, &to)?;
+                to.write_json("report.json", &report)?;
             }
-            if let Some(model) = row.model.as_ref().filter(|_| !row.key.contains('/')) {
-                RunFolder::existing(&place.join(&row.key)).write_json("model.json", model)?;
+            if row.key.contains('/') {
+                continue; // of the checkpoint of the row that it is in
+            }
+            let to = RunFolder::existing(&place.join(&row.key));
+            if let Some(model) = &row.model {
+                to.write_json("model.json", model)?;
+            }
+            if let Some(log) = &row.log {
+                to.write_text(LOG, &every_tenth(log))?;
             }
         }
         RunFolder::existing(place).write_json(CLAIMS, &self.claims)
@@ -172,7 +187,18 @@ fn read_row(place: &Path, key: &str, title: &str, published: Option<[f64; 2]>) -
     // Rows of test time are of the checkpoint of the row that they are in.
     let model = folder.ancestors().take(2).map(|f| f.join("model.json")).find(|f| f.is_file());
     let model = model.map(|file| read_json(&file)).transpose()?;
-    Ok(Row { key: key.into(), title: title.into(), published, reports, folders, model })
+    let log = folder.join(LOG);
+    let log = log.is_file().then(|| std::fs::read_to_string(&log).map_err(IoError::at(&log))).transpose()?;
+    Ok(Row { key: key.into(), title: title.into(), published, reports, folders, model, log })
+}
+
+/// The lines of a training's log whose step is a multiple of ten.
+fn every_tenth(log: &str) -> String {
+    let step = |line: &str| serde_json::from_str::<Value>(line).ok()?.get("step")?.as_u64();
+    log.lines()
+        .filter(|line| step(line).is_some_and(|n| n.is_multiple_of(10)))
+        .map(|line| format!("{line}\n"))
+        .collect()
 }
 
 impl Row {

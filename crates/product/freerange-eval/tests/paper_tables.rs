@@ -66,6 +66,9 @@ fn rows_stand_beside_the_papers_numbers_and_claims_are_answered() {
     let facts = json!({ "trainable": 7_433_756, "samples": 40_000, "training_seconds": 3600.0 });
     fs::write(place.path().join("full/model.json"), facts.to_string()).unwrap();
 
+    let log: String = (1..=25).map(|step| format!("{{\"step\":{step}}}\n")).collect();
+    fs::write(place.path().join("full/log.jsonl"), log).unwrap();
+
     let found = PaperTables::read(place.path(), 0).unwrap();
     let answers: Vec<(&str, &str)> = found.claims.iter().map(|c| (&c.claim[..9], c.answer())).collect();
     let mut expected = vec![("From one ", "yes"), ("Flow matc", "no"), ("Flow matc", "not decided")];
@@ -105,7 +108,24 @@ fn rows_stand_beside_the_papers_numbers_and_claims_are_answered() {
 
     let kept = tempfile::tempdir().unwrap();
     found.keep(kept.path()).unwrap();
-    assert_eq!(PaperTables::read(kept.path(), 0).unwrap().markdown(), text);
+    let log = fs::read_to_string(kept.path().join("full/log.jsonl")).unwrap();
+    assert_eq!(log, "{\"step\":10}\n{\"step\":20}\n");
+    // Features of the one view of two that is unseen: of the render, and of the image.
+    let file = "scans/objects/o00.partial.4.vgg.f32";
+    let all = fs::read(place.path().join("full").join(file)).unwrap();
+    let views: Vec<&[u8]> = all.chunks(4 * WIDTH).collect();
+    let features = || fs::read(kept.path().join("full").join(file)).unwrap();
+    assert!(features() == [views[0], views[2]].concat());
+    // From what is kept alone. The claim is kept, too, for where features are not.
+    fs::remove_dir_all(kept.path().join("no_flow_matching/scans/objects")).unwrap();
+    let again = PaperTables::read(kept.path(), 0).unwrap();
+    assert_eq!(again.markdown(), text);
+    // Onto itself, which reads the kept features.
+    let files =
+        || (features(), ["full/log.jsonl", "full/scans/report.json"].map(|f| fs::read(kept.path().join(f)).unwrap()));
+    let before = files();
+    again.keep(kept.path()).unwrap();
+    assert!(files() == before);
 }
 
 #[test]

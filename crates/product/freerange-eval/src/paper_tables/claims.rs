@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use super::{INPUTS, Row};
+use super::{INPUTS, PARENT, Row};
 use crate::{
-    EvalError,
-    record::ViewSet,
+    EvalError, Report, RunFolder,
+    record::{Outcome, Record, VggFeatures, ViewSet},
     scorer::frechet_vgg,
     statistics::{Interval, bootstrap, quantile},
     table::{Cell, Table},
@@ -16,6 +16,8 @@ use crate::{
 /// Resamples of the Frechet distance: each wants two roots of matrices.
 const FRECHET_RESAMPLES: usize = 200;
 
+/// The row that is compared with Full by what is new in its views.
+const WITHOUT_FLOW: &str = "no_flow_matching";
 const FRECHET_CLAIM: &str =
     "One sample of Full beats No flow matching in Frechet distance (VGG16) on views that no input saw";
 
@@ -109,7 +111,7 @@ fn psnr_claims(rows: &[Row], full: &Row, source: &str, seed: u64) -> Vec<Claim> 
             theirs.iter().filter_map(|(object, lost)| Some(lost - ours.get(object)?)).collect(),
         );
     }
-    if let Some(without) = find("no_flow_matching") {
+    if let Some(without) = find(WITHOUT_FLOW) {
         for views in [ViewSet::Full, ViewSet::Partial] {
             let (ours, theirs) = (of(full, views), of(without, views));
             add(
@@ -135,16 +137,36 @@ fn unseen_features(row: &Row, source: &str) -> Result<BTreeMap<String, Unseen>, 
         let all = folder.vgg_features(case, kept.count)?;
         let width = kept.count / (parts * kept.unseen.len().max(1));
         let at = |part: usize, view: usize| all[(part * kept.unseen.len() + view) * width..][..width].to_vec();
-        let views = (0..kept.unseen.len()).filter(|&i| kept.unseen[i]);
-        out.insert(case.object.clone(), views.map(|i| (at(0, i), at(1, i))).collect());
+        let views: Unseen = (0..kept.unseen.len()).filter(|&i| kept.unseen[i]).map(|i| (at(0, i), at(1, i))).collect();
+        if !views.is_empty() {
+            out.insert(case.object.clone(), views);
+        }
     }
     Ok(out)
+}
+
+/// Writes the features of unseen views of the rows that the claim compares, and has `report` say so.
+pub(super) fn keep_features(row: &Row, source: &str, report: &mut Report, to: &RunFolder) -> Result<(), EvalError> {
+    if row.key != PARENT && row.key != WITHOUT_FLOW {
+        return Ok(());
+    }
+    let found = unseen_features(row, source)?;
+    for Record { case, outcome } in &mut report.records {
+        let (Outcome::Measured(measured), Some(views)) = (outcome, found.get(&case.object)) else { continue };
+        if case.views == ViewSet::Partial {
+            let all: Vec<f32> =
+                views.iter().flat_map(|v| &v.0).chain(views.iter().flat_map(|v| &v.1)).copied().collect();
+            to.write_vgg_features(case, &all)?;
+            measured.vgg = Some(VggFeatures { count: all.len(), unseen: vec![true; views.len()], samples: 1 });
+        }
+    }
+    Ok(())
 }
 
 /// One sample of Full beats No flow matching in Frechet distance on views that no input saw.
 fn frechet_claim(rows: &[Row], full: &Row, source: &str, seed: u64) -> Result<Option<Claim>, EvalError> {
     use rand::{Rng, SeedableRng};
-    let Some(without) = rows.iter().find(|r| r.key == "no_flow_matching") else { return Ok(None) };
+    let Some(without) = rows.iter().find(|r| r.key == WITHOUT_FLOW) else { return Ok(None) };
     let (ours, theirs) = (unseen_features(full, source)?, unseen_features(without, source)?);
     let objects: Vec<&String> = ours.keys().filter(|o| theirs.contains_key(*o)).collect();
     if objects.len() < 2 {
