@@ -83,10 +83,7 @@ fn layout<const N: usize>(
     for (name, thousands, objaverse, gso) in published {
         let mut row = vec![Cell::text(format!("{name} (published)")), Cell::text(format!("{thousands}K"))];
         for values in [objaverse, gso] {
-            // As printed there: 102.3 has one decimal, every other figure two.
-            row.extend(
-                values.iter().map(|v| Cell::text(if *v < 100.0 { format!("{v:.2}") } else { format!("{v:.1}") })),
-            );
+            row.extend(values.iter().map(|v| Cell::text(printed(*v))));
         }
         row.extend(columns.iter().map(|_| Cell::text("")));
         table.rows.push(row);
@@ -105,6 +102,11 @@ fn layout<const N: usize>(
         table.rows.push(row);
     }
     Some(table)
+}
+
+/// A value as the paper prints it: 102.3 has one decimal, every other figure two.
+pub fn printed(value: f64) -> String {
+    if value < 100.0 { format!("{value:.2}") } else { format!("{value:.1}") }
 }
 
 /// Gaussians as the paper writes them: `8.2K`.

@@ -10,7 +10,7 @@ use super::{
 use crate::{
     EvalError,
     compare::{Comparison, Paired, compare},
-    paper::{FULL, GSO, NUMBER_OF_VIEWS, PARTIAL, thousands},
+    paper::{FULL, GSO, NUMBER_OF_VIEWS, PARTIAL, printed, thousands},
     record::{ViewSet, style},
     report::Group,
     statistics::{bootstrap, mean},
@@ -95,6 +95,30 @@ fn signed(paired: &Paired) -> String {
     format!("{mean} ({low} to {high})")
 }
 
+/// A column of Tables 1 and 2: its head, which of the paper's values is in it, and our metric, its factor and decimals.
+type Column = (&'static str, Option<usize>, &'static str, f64, usize);
+
+const PARTIAL_COLUMNS: [Column; 7] = [
+    ("PSNR", Some(0), "psnr", 1.0, 2),
+    ("DINO x100", Some(1), "dino", 100.0, 2),
+    ("DreamSim x100", Some(2), "dreamsim", 100.0, 2),
+    ("FID", Some(3), "fid", 1.0, 2),
+    ("SSIM x100", None, "ssim", 100.0, 2),
+    ("LPIPS (AlexNet) x1000", None, "lpips-alex", 1000.0, 1),
+    ("LPIPS (VGG) x1000", None, "lpips-vgg", 1000.0, 1),
+];
+/// The paper does not say which LPIPS its values are.
+const FULL_COLUMNS: [Column; 5] = [
+    ("PSNR", Some(0), "psnr", 1.0, 2),
+    ("SSIM x100", Some(1), "ssim", 100.0, 2),
+    ("LPIPS (paper's own) x1000", Some(2), "", 1000.0, 1),
+    ("LPIPS (AlexNet) x1000", None, "lpips-alex", 1000.0, 1),
+    ("LPIPS (VGG) x1000", None, "lpips-vgg", 1000.0, 1),
+];
+/// Columns of the Frechet distance, which the paper does not have.
+const FRECHET: [&str; 5] =
+    ["Frechet (VGG16)", "same, of four samples' mean", "same, unseen views", "unseen, mean", "unseen images"];
+
 /// Tables 1 and 2: the methods of the paper, published, and ours below.
 pub(super) fn methods(rows: &[Row], source: &str, views: ViewSet) -> Option<Table> {
     let keys = [PARENT, FOUR_SAMPLES, "no_flow_matching", "pixel_aligned", "voxel_aligned", "pipeline"];
@@ -106,57 +130,35 @@ pub(super) fn methods(rows: &[Row], source: &str, views: ViewSet) -> Option<Tabl
     if ours.is_empty() {
         return None;
     }
-    let number = if views == ViewSet::Partial { 1 } else { 2 };
+    let (number, columns): (_, &[Column]) = match views {
+        ViewSet::Partial => (1, &PARTIAL_COLUMNS),
+        ViewSet::Full => (2, &FULL_COLUMNS),
+    };
     let caption =
         format!("The paper's Table {number}, {views} observation: published numbers are of GSO, ours of {source}");
-    let head = [
-        "method",
-        "#GS",
-        "objects",
-        "PSNR",
-        "SSIM x100",
-        "LPIPS (paper's own) x1000",
-        "LPIPS (AlexNet) x1000",
-        "LPIPS (VGG) x1000",
-        "FID",
-        "Frechet (VGG16)",
-        "same, of four samples' mean",
-        "same, unseen views",
-        "unseen, mean",
-        "unseen images",
-    ];
-    let mut table = Table::new(caption, &head);
-    let text = |v: Option<f64>, decimals: usize| or_empty(v.map(|v| format!("{v:.decimals$}")));
-    let mut publish = |name: &str, thousands: u32, [psnr, ssim, lpips, fid]: [Option<f64>; 4]| {
-        let mut row =
-            vec![Cell::text(format!("{name} (published)")), Cell::text(format!("{thousands}K")), Cell::text(GSO)];
-        row.extend([text(psnr, 2), text(ssim, 2), text(lpips, 1), Cell::default(), Cell::default(), text(fid, 2)]);
-        row.resize(head.len(), Cell::default());
+    let mut table = Table::new(caption, &["method", "#GS", "objects"]);
+    table.head.extend(columns.iter().map(|c| c.0).chain(FRECHET).map(String::from));
+    let mut publish = |name: &str, thousands: u32, values: &[f64]| {
+        let mut row = vec![Cell::text(format!("{name} (published)")), Cell::text(format!("{thousands}K"))];
+        row.push(Cell::text(GSO));
+        row.extend(columns.iter().map(|c| or_empty(c.1.map(|i| printed(values[i])))));
+        row.resize(row.len() + FRECHET.len(), Cell::default());
         table.rows.push(row);
     };
     match views {
-        ViewSet::Partial => {
-            PARTIAL.iter().for_each(|(n, k, _, g)| publish(n, *k, [Some(g[0]), None, None, Some(g[3])]))
-        }
-        ViewSet::Full => {
-            FULL.iter().for_each(|(n, k, _, g)| publish(n, *k, [Some(g[0]), Some(g[1]), Some(g[2]), None]))
-        }
+        ViewSet::Partial => PARTIAL.iter().for_each(|(name, k, _, gso)| publish(name, *k, gso)),
+        ViewSet::Full => FULL.iter().for_each(|(name, k, _, gso)| publish(name, *k, gso)),
     }
+    let text = |v: Option<f64>, decimals: usize| or_empty(v.map(|v| format!("{v:.decimals$}")));
     for (row, group) in ours {
-        let value =
-            |metric: &str, factor: f64, decimals: usize| text(group.value(metric).map(|v| factor * v), decimals);
+        let mut cells =
+            vec![Cell::text(&row.title), Cell::text(thousands(group.gaussians)), Cell::text(group.measured)];
+        cells.extend(
+            columns
+                .iter()
+                .map(|&(_, _, metric, factor, decimals)| text(group.value(metric).map(|v| factor * v), decimals)),
+        );
         let frechet = group.frechet_vgg;
-        let mut cells = vec![
-            Cell::text(&row.title),
-            Cell::text(thousands(group.gaussians)),
-            Cell::text(group.measured),
-            value("psnr", 1.0, 2),
-            value("ssim", 100.0, 2),
-            Cell::default(),
-            value("lpips-alex", 1000.0, 1),
-            value("lpips-vgg", 1000.0, 1),
-            value("fid", 1.0, 2),
-        ];
         cells.extend([
             text(frechet.map(|f| f.sample), 2),
             text(frechet.and_then(|f| f.mean), 2),
