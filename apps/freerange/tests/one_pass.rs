@@ -37,17 +37,23 @@ fn text(path: &Path) -> &str {
     path.to_str().unwrap()
 }
 
+/// A checkpoint of two training steps in `place`, in the folder `run`.
+fn trained(place: &Path, run: &str) -> PathBuf {
+    std::fs::write(place.join("model.toml"), CONFIG).unwrap();
+    let run = place.join(run);
+    let trained = freerange(&["train", text(&place.join("model.toml")), "-o", text(&run)]);
+    assert!(trained.status.success(), "{}", String::from_utf8_lossy(&trained.stderr));
+    run.join("checkpoint.safetensors")
+}
+
 #[test]
 fn a_pixel_aligned_model_goes_through_every_command() {
     let place = tempfile::tempdir().unwrap();
     let path = |name: &str| -> PathBuf { place.path().join(name) };
-    std::fs::write(path("model.toml"), CONFIG).unwrap();
-    let (config, run) = (path("model.toml"), path("run"));
-    let dry = freerange(&["train", text(&config), "--dry-run"]);
+    let checkpoint = trained(place.path(), "run");
+    let dry = freerange(&["train", text(&path("model.toml")), "--dry-run"]);
     let said = String::from_utf8_lossy(&dry.stdout).into_owned();
     assert!(dry.status.success() && said.contains("512 Gaussians: 10 tokens each"), "{said}"); // two views of 16 x 16
-    assert!(freerange(&["train", text(&config), "-o", text(&run)]).status.success());
-    let checkpoint = run.join("checkpoint.safetensors");
 
     let info = freerange(&["model", "info", text(&checkpoint), "--json"]);
     let info: serde_json::Value = serde_json::from_slice(&info.stdout).unwrap();
@@ -55,6 +61,31 @@ fn a_pixel_aligned_model_goes_through_every_command() {
 
     let scene = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/bowl");
     let out = path("out");
+    let reconstruct = ["reconstruct", scene, "--checkpoint", text(&checkpoint), "--device", "cpu", "-o", text(&out)];
+    let with = |more: &[&str]| freerange(&[&reconstruct[..], more].concat());
+    let made = with(&["--iterations", "3", "--set", "propose.flow.coupling=independent"]); // the model's own
+    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    let report: serde_json::Value = serde_json::from_slice(&std::fs::read(out.join("report.json")).unwrap()).unwrap();
+    assert!(report["gaussians"].as_u64().unwrap() >= 2 * 16 * 16, "two views, one Gaussian per pixel: {report}");
+
+    let evaluation = path("rows/full/bowl");
+    let eval = ["eval", "--generated", "1", "--checkpoint", text(&checkpoint), "--device", "cpu"];
+    let eval = [&eval[..], &["--metrics", "psnr", "--pictures", "none", "-o", text(&evaluation)]].concat();
+    let eval = freerange(&eval);
+    assert!(eval.status.success(), "{}", String::from_utf8_lossy(&eval.stderr));
+    let tables = freerange(&["eval", "paper-tables", text(&path("rows"))]);
+    let said = String::from_utf8_lossy(&tables.stdout).into_owned();
+    assert!(said.contains("| Full |") && said.contains("Not measured yet: Full, another seed;"), "{said}");
+    let nothing = freerange(&["eval", "paper-tables", text(&path("run"))]);
+    assert_eq!(nothing.status.code(), Some(2), "{}", String::from_utf8_lossy(&nothing.stderr));
+}
+
+#[test]
+fn settings_without_effect_on_one_pass_are_refused() {
+    let place = tempfile::tempdir().unwrap();
+    let checkpoint = trained(place.path(), "run");
+    let out = place.path().join("out");
+    let scene = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/bowl");
     let reconstruct = ["reconstruct", scene, "--checkpoint", text(&checkpoint), "--device", "cpu", "-o", text(&out)];
     let with = |more: &[&str]| freerange(&[&reconstruct[..], more].concat());
     for (option, field) in [
@@ -78,19 +109,36 @@ fn a_pixel_aligned_model_goes_through_every_command() {
         let refused = with(&option);
         assert_eq!(refused.status.code(), Some(2), "{option:?}: {}", String::from_utf8_lossy(&refused.stderr));
     }
-    let made = with(&["--iterations", "3", "--set", "propose.flow.coupling=independent"]); // the model's own
-    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
-    let report: serde_json::Value = serde_json::from_slice(&std::fs::read(out.join("report.json")).unwrap()).unwrap();
-    assert!(report["gaussians"].as_u64().unwrap() >= 2 * 16 * 16, "two views, one Gaussian per pixel: {report}");
+}
 
-    let evaluation = path("rows/full/bowl");
-    let eval = ["eval", "--generated", "1", "--checkpoint", text(&checkpoint), "--device", "cpu"];
-    let eval = [&eval[..], &["--metrics", "psnr", "--pictures", "none", "-o", text(&evaluation)]].concat();
-    let eval = freerange(&eval);
+#[test]
+fn the_picture_beside_the_tables_shows_the_rows_that_were_trained() {
+    let place = tempfile::tempdir().unwrap();
+    let path = |name: &str| -> PathBuf { place.path().join(name) };
+    let checkpoint = trained(place.path(), "runs/pixel_aligned");
+    let (rows, runs, picture) = (path("rows"), path("runs"), path("picture.png"));
+    let source = ["--generated", "1", "--generated-size", "32"];
+    let row = path("rows/full/generated");
+    let eval = ["eval", "--checkpoint", text(&checkpoint), "--device", "cpu", "--metrics", "psnr", "-o", text(&row)];
+    let eval = freerange(&[&eval[..], &source].concat());
     assert!(eval.status.success(), "{}", String::from_utf8_lossy(&eval.stderr));
-    let tables = freerange(&["eval", "paper-tables", text(&path("rows"))]);
-    let said = String::from_utf8_lossy(&tables.stdout).into_owned();
-    assert!(said.contains("| Full |") && said.contains("Not measured yet: Full, another seed;"), "{said}");
-    let nothing = freerange(&["eval", "paper-tables", text(&path("run"))]);
-    assert_eq!(nothing.status.code(), Some(2), "{}", String::from_utf8_lossy(&nothing.stderr));
+
+    let tables = ["eval", "paper-tables", text(&rows), "--picture", text(&picture), "--runs", text(&runs)];
+    let with = |more: &[&str]| freerange(&[&tables[..], &source, more].concat());
+    let made = with(&[]);
+    let error = String::from_utf8_lossy(&made.stderr).into_owned();
+    assert!(made.status.success() && error.contains("no_flow_matching: not in the image"), "{error}");
+    let found = image::open(&picture).unwrap().to_rgb8();
+    // Inputs, true view and the one row; below them nothing, nothing and the row's Gaussians.
+    assert_eq!(found.dimensions(), (3 * 32, 2 * 32));
+    let ink = |x: u32, y: u32| {
+        let part = image::imageops::crop_imm(&found, x * 32, y * 32, 32, 32).to_image();
+        part.pixels().filter(|p| p.0 != [255; 3]).count()
+    };
+    assert!(ink(0, 0) > 0 && ink(1, 0) > 0, "{} {}", ink(0, 0), ink(1, 0));
+    assert_eq!((ink(0, 1), ink(1, 1)), (0, 0));
+
+    let refused = with(&["--objects", "nothing"]);
+    let error = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert!(refused.status.code() == Some(2) && error.contains("--objects: expected names among"), "{error}");
 }
