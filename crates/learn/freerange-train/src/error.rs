@@ -61,6 +61,17 @@ pub enum TrainError {
         /// The norm of its gradients.
         norm: f32,
     },
+    /// Nothing has changed the weights for long.
+    #[error(
+        "step {last}: expected gradients, found none, as in the {steps} steps up to it: training stopped; Gaussians whose opacity \
+         is below 1/255 are not drawn and have no gradient"
+    )]
+    NoGradient {
+        /// Steps in a row.
+        steps: u32,
+        /// The last of them.
+        last: u64,
+    },
     /// A training state cannot be continued.
     #[error("{}: {problem}", path.display())]
     State {

@@ -52,6 +52,7 @@ pub struct Trainer {
     interrupt_when: Box<dyn Fn() -> bool>,
     ahead: Option<Result<Batch, TrainError>>, // of the next step
     not_finite: u32,                          // steps in a row
+    no_gradient: u32,                         // likewise
     validation: Option<Validation>,
     folder: PathBuf,
     _lock: Option<File>, // of the folder, on rank 0

@@ -126,6 +126,7 @@ impl Trainer {
             interrupt_when: Box::new(|| false),
             ahead: None,
             not_finite: 0,
+            no_gradient: 0,
             validation,
             folder: folder.into(),
             _lock: lock,

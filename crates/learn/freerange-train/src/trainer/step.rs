@@ -21,6 +21,8 @@ pub(super) const GRADIENT_STATISTIC_DECAY: f32 = 0.99;
 /// Steps in a row whose loss or gradients are not finite that end a run. Fewer are left out: a batch may be bad, a model
 /// that always fails is.
 pub(super) const NOT_FINITE_IN_A_ROW: u32 = 5;
+/// Steps in a row whose gradients are all zero after which training stops.
+pub(super) const NO_GRADIENT_IN_A_ROW: u32 = 20;
 
 /// What the objects of this rank gave in a step.
 struct Computed {
@@ -89,6 +91,10 @@ impl Trainer {
         self.not_finite = if finite { 0 } else { self.not_finite + 1 };
         if self.not_finite == NOT_FINITE_IN_A_ROW {
             return Err(TrainError::NotFinite { steps: self.not_finite, last: p.step, loss: total, norm });
+        }
+        self.no_gradient = if norm == 0.0 { self.no_gradient + 1 } else { 0 };
+        if self.no_gradient == NO_GRADIENT_IN_A_ROW {
+            return Err(TrainError::NoGradient { steps: self.no_gradient, last: self.progress.step });
         }
         Ok(StepReport {
             step: self.progress.step,

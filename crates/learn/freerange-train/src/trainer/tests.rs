@@ -12,7 +12,7 @@ use freerange_model::EncoderConfig;
 
 use super::{
     folder::claim,
-    step::{GRADIENT_STATISTIC_DECAY, NOT_FINITE_IN_A_ROW},
+    step::{GRADIENT_STATISTIC_DECAY, NO_GRADIENT_IN_A_ROW, NOT_FINITE_IN_A_ROW},
     *,
 };
 use crate::{
@@ -22,6 +22,7 @@ use crate::{
     train,
 };
 use freerange_diffusion::sample::{FlowConfig, RefinerConfig};
+use glam::DMat4;
 
 type TrainConfig = crate::config::TrainConfig<MakingConfig>;
 
@@ -153,6 +154,40 @@ fn a_model_that_always_fails_ends_with_its_state() {
     let mut again = open(&config(), folder.path(), None);
     let report = again.step().unwrap();
     assert!(report.loss.is_finite() && report.step == 7 && report.skipped == 5, "{report:?}");
+}
+
+/// Of one pass, whose losses are renders alone: of cameras that look away they have no gradient.
+#[test]
+fn a_model_without_gradients_ends_with_its_state() {
+    let text = SMALL
+        .replace("[model]", "[model]\nkind = \"latent_tokens\"\nlatent_tokens = 4\ngradient_channels = false")
+        .replace("held_views = 0\nheld = false", "flow = false\nunconditional = 0.0\nheld_views = 1")
+        .replace("steps = 40", "steps = 100");
+    let text = format!("{text}\n[sample]\nsteps = 1\ncfg_scale = 1.0\nlambda_pg = 0.0\n");
+    let config: TrainConfig = toml::from_str(&text).unwrap();
+    config.validate().unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let mut trainer = open(&config, folder.path(), None);
+    let looking_away = |trainer: &mut Trainer| {
+        let batch = trainer.ahead.as_mut().unwrap().as_mut().unwrap();
+        let targets = [Some(&mut batch.seen), batch.held.as_mut()].into_iter().flatten();
+        for camera in targets.flat_map(|targets| targets.cameras.iter_mut().flatten()) {
+            camera.world_to_camera = DMat4::from_rotation_y(std::f64::consts::PI) * camera.world_to_camera;
+        }
+        trainer.step()
+    };
+    assert!(trainer.step().unwrap().gradient_norm > 0.0);
+    for _ in 0..2 {
+        // A step with gradients begins the count again.
+        for _ in 1..NO_GRADIENT_IN_A_ROW {
+            assert_eq!(looking_away(&mut trainer).unwrap().gradient_norm, 0.0);
+        }
+        assert!(trainer.step().unwrap().gradient_norm > 0.0);
+    }
+    (1..NO_GRADIENT_IN_A_ROW).for_each(|_| drop(looking_away(&mut trainer).unwrap()));
+    let error = looking_away(&mut trainer).unwrap_err();
+    assert!(matches!(error, TrainError::NoGradient { steps: NO_GRADIENT_IN_A_ROW, .. }), "{error}");
+    trainer.save().unwrap();
 }
 
 #[test]
