@@ -5,10 +5,7 @@
 //! LaRa's (Chen et al. 2024). Lengths are of the canonical frame, in which the object's sphere has the diameter 1. Both
 //! papers' scenes have twice that, so that their bounds on lengths are halved here.
 
-use burn::tensor::{
-    Tensor, TensorData,
-    activation::{sigmoid, softplus},
-};
+use burn::tensor::{Tensor, TensorData, activation::sigmoid};
 
 use crate::{
     ModelConfig, ModelKind, PLUCKER, VolumeConfig,
@@ -23,9 +20,6 @@ pub(crate) const REACH: f32 = 0.75;
 const PIXEL_SCALE: [f32; 2] = [-2.3 - std::f32::consts::LN_2, -1.2 - std::f32::consts::LN_2];
 /// What is added to logits of opacity: Gaussians begin faint.
 const OPACITY_BIAS: f32 = -2.0;
-/// Logits of opacity of voxel-aligned Gaussians stay above: 0.018. Below 1/255 none is drawn, and none has a gradient. Without this
-/// a volume, which begins as fog before random colors, learns to be empty in 200 steps and stays so.
-const FAINTEST: f32 = -4.0;
 /// Half of a volume's side: the object's radius and a margin for the estimated frame.
 pub(crate) const HALF_SIDE: f32 = 0.55;
 /// Largest scale of a voxel-aligned Gaussian, in cells; they begin at half a cell.
@@ -99,15 +93,14 @@ fn on_rays(out: Tensor<3>, rays: Tensor<3>) -> Tensor<3> {
 }
 
 /// Voxel-aligned Gaussians. `out` `[b, n, 14]`, cell by cell of token by token, to `[b, n, 14]`.
-pub(crate) fn in_cells(out: Tensor<3>, volume: &VolumeConfig) -> Tensor<3> {
+fn in_cells(out: Tensor<3>, volume: &VolumeConfig) -> Tensor<3> {
     let part = |first: usize, count: usize| out.clone().narrow(2, first, count);
     let cell = 2.0 * HALF_SIDE / (volume.tokens_per_side * volume.cells_per_token_side) as f32;
     let centers = cell_centers(volume);
     let centers = Tensor::<3>::from_data(TensorData::new(centers, [1, out.dims()[1], 3]), &out.device());
     let center = centers + bounded(part(0, 3)) * cell;
     let log_scale = (part(3, 3) + (cell / 2.0).ln()).clamp_max((LARGEST_IN_CELLS * cell).ln());
-    let opacity = softplus(part(10, 1) + (OPACITY_BIAS - FAINTEST), 1.0) + FAINTEST;
-    Tensor::cat(vec![center, log_scale, rotation(part(6, 4)), opacity, sigmoid(part(11, 3))], 2)
+    Tensor::cat(vec![center, log_scale, rotation(part(6, 4)), part(10, 1) + OPACITY_BIAS, sigmoid(part(11, 3))], 2)
 }
 
 /// The center of each Gaussian's cell, token by token in the order x, y, z with z fastest, its cells likewise. `[n, 3]`
