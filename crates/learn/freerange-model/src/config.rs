@@ -77,7 +77,12 @@ impl VolumeConfig {
 
     /// Gaussians of each token.
     pub fn gaussians_per_token(&self) -> usize {
-        self.cells_per_token_side.pow(3) * self.gaussians_per_cell
+        self.cells_per_token() * self.gaussians_per_cell
+    }
+
+    /// Cells of each token.
+    pub fn cells_per_token(&self) -> usize {
+        self.cells_per_token_side.pow(3)
     }
 }
 
@@ -234,6 +239,11 @@ impl ModelConfig {
             ModelKind::PixelAligned => self.image_tokens(views),
             ModelKind::LatentTokens | ModelKind::VoxelAligned => self.learned_tokens(),
         }
+    }
+
+    /// What each view shows at a token of a volume, beside its features: one pixel per cell. 0 for other kinds.
+    pub fn cell_channels(&self) -> usize {
+        self.volume.map_or(0, |v| v.cells_per_token() * self.image_channels())
     }
 
     pub(crate) fn image_tokens(&self, views: usize) -> usize {

@@ -5,7 +5,7 @@
 
 use burn::{
     module::{Module, Param},
-    tensor::{Device, Tensor, TensorData, activation::silu},
+    tensor::{Device, Int, Tensor, TensorData, activation::silu},
 };
 
 use crate::{
@@ -23,7 +23,8 @@ pub struct Dit {
     registers: Param<Tensor<2>>, // [registers, d]
     img_in: Linear,
     gs_in: Option<Linear>, // of flow matching, as is the time
-    t_mlp: Option<TimeMlp>,
+    t_mlp: Option<Mlp>,
+    lift: Option<Mlp>,                 // of voxel-aligned models
     latents: Option<Param<Tensor<2>>>, // learned tokens instead, [tokens, d]
     blocks: Vec<Block>,
     output: Output,
@@ -40,10 +41,21 @@ pub struct Dit {
     recompute: bool,
 }
 
+/// Two layers with a SiLU between them.
 #[derive(Module, Debug)]
-struct TimeMlp {
+struct Mlp {
     first: Linear,
     second: Linear,
+}
+
+/// What each view shows where the tokens of a volume lie.
+#[derive(Clone, Debug)]
+pub struct CellViews {
+    /// Which of an object's image tokens (view by view, row by row) shows the token's center; as many as there are image
+    /// tokens: none. `[b, views * tokens]`
+    pub patches: Tensor<2, Int>,
+    /// The pixel at the center of each of its cells, zeros outside of the image. `[b, views, tokens, cells * channels]`
+    pub pixels: Tensor<4>,
 }
 
 /// What the network is told of the Gaussians besides their noisy selves. What is missing is zeros.
@@ -274,11 +286,18 @@ impl Dit {
                 _ => None,
             },
             t_mlp: match config.kind {
-                ModelKind::FlowMatching => Some(TimeMlp {
+                ModelKind::FlowMatching => Some(Mlp {
                     first: builder.linear(&name("t_mlp.0"), config.time_features, d, Init::Normal(0.02))?,
                     second: builder.linear(&name("t_mlp.2"), d, d, Init::Normal(0.02))?,
                 }),
                 _ => None,
+            },
+            lift: match config.cell_channels() {
+                0 => None,
+                channels => Some(Mlp {
+                    first: builder.linear(&name("lift.0"), d + channels, d, Init::Xavier)?,
+                    second: builder.linear(&name("lift.2"), d, d, Init::Xavier)?,
+                }),
             },
             latents: match config.learned_tokens() {
                 0 => None,
@@ -367,7 +386,7 @@ impl Dit {
     /// # Panics
     /// If the model predicts in one pass: it has no time.
     pub fn condition(&self, t: Tensor<1>) -> Tensor<2> {
-        let TimeMlp { first, second } = self.t_mlp.as_ref().expect("a model of flow matching");
+        let Mlp { first, second } = self.t_mlp.as_ref().expect("a model of flow matching");
         second.forward(silu(first.forward(time_embedding(t, self.time_features))))
     }
 
@@ -392,22 +411,41 @@ impl Dit {
         let gaussians = Tensor::cat(gaussians, 2);
         let width = gaussians.dims()[2] * p;
         let gs_in = self.gs_in.as_ref().expect("a model of flow matching");
-        self.sequence(image_tokens, Some(gs_in.forward(gaussians.reshape([b, n / p, width]))))
+        let gaussians = gs_in.forward(gaussians.reshape([b, n / p, width]));
+        self.sequence(b, self.image_inputs(image_tokens), Some(gaussians))
     }
 
     /// Registers, image tokens, and the tokens that become Gaussians where these are others. `[b, t, d]`
-    fn sequence(&self, image_tokens: Tensor<3>, others: Option<Tensor<3>>) -> Tensor<3> {
-        let b = image_tokens.dims()[0];
+    fn sequence(&self, b: usize, images: Option<Tensor<3>>, others: Option<Tensor<3>>) -> Tensor<3> {
         let mut parts = Vec::with_capacity(3);
         let registers = self.registers.val(); // [r, d]
         if registers.dims()[0] > 0 {
             parts.push(registers.unsqueeze_dim::<3>(0).repeat_dim(0, b));
         }
-        if image_tokens.dims()[1] > 0 {
-            parts.push(self.img_in.forward(image_tokens));
-        }
+        parts.extend(images);
         parts.extend(others);
         Tensor::cat(parts, 1)
+    }
+
+    /// Image tokens as the first block takes them, if there are any. `[b, m, d]`
+    fn image_inputs(&self, image_tokens: Tensor<3>) -> Option<Tensor<3>> {
+        (image_tokens.dims()[1] > 0).then(|| self.img_in.forward(image_tokens))
+    }
+
+    /// What the views show of each token of a volume: an MLP of the image token and the pixels there, its mean over views.
+    /// `images` `[b, m, d]` to `[b, tokens, d]`.
+    fn lifted(&self, images: Tensor<3>, cells: CellViews) -> Tensor<3> {
+        let Mlp { first, second } = self.lift.as_ref().expect("a voxel-aligned model");
+        let ([b, m, d], [_, views, tokens, _]) = (images.dims(), cells.pixels.dims());
+        let device = images.device();
+        let nothing = Tensor::zeros([b, 1, d], &device);
+        let features = Tensor::cat(vec![images, nothing], 1).reshape([b * (m + 1), d]);
+        let starts: Vec<i64> = (0..b).map(|i| (i * (m + 1)) as i64).collect();
+        let starts = Tensor::<1, Int>::from_data(TensorData::new(starts, [b]), &device).reshape([b, 1]);
+        let at = (cells.patches + starts).reshape([b * views * tokens]);
+        let features = features.select(0, at).reshape([b, views, tokens, d]);
+        let seen = silu(first.forward(Tensor::cat(vec![features, cells.pixels], 3)));
+        second.forward(seen.mean_dim(1).reshape([b, tokens, d]))
     }
 
     /// All blocks, and the output layer on the last `queries` tokens: `[b, queries, output channels]`.
@@ -431,18 +469,24 @@ impl Dit {
 
     /// What a model that predicts in one pass says of each token that becomes Gaussians, before decoding.
     ///
-    /// `image_tokens`: `[b, m, image_channels]`. Returns `[b, tokens, channels]`: one row per learned token, or per image
-    /// token of a pixel-aligned model.
+    /// `image_tokens`: `[b, m, image_channels]`; `cells` for a voxel-aligned model and no other. Returns
+    /// `[b, tokens, channels]`: one row per learned token, or per image token of a pixel-aligned model.
     ///
     /// # Panics
-    /// If this is a model of flow matching.
-    pub fn predict(&self, image_tokens: Tensor<3>) -> Tensor<3> {
+    /// If this is a model of flow matching, or cells are missing or not wanted.
+    pub fn predict(&self, image_tokens: Tensor<3>, cells: Option<CellViews>) -> Tensor<3> {
         assert!(self.gs_in.is_none(), "a model of flow matching predicts from noise");
         let [b, m, _] = image_tokens.dims();
         let latents = self.latents.as_ref().map(|l| l.val().unsqueeze_dim::<3>(0).repeat_dim(0, b)); // [b, tokens, d]
         let queries = latents.as_ref().map_or(m, |l| l.dims()[1]);
         let no_time = Tensor::zeros([b, 1], &image_tokens.device());
-        let x = self.sequence(image_tokens, latents);
+        let images = self.image_inputs(image_tokens);
+        assert_eq!(self.lift.is_some(), cells.is_some(), "views of cells belong to a voxel-aligned model");
+        let latents = match (latents, &images, cells) {
+            (Some(latents), Some(images), Some(cells)) => Some(latents + self.lifted(images.clone(), cells)),
+            (latents, _, _) => latents,
+        };
+        let x = self.sequence(b, images, latents);
         self.blocks_and_output(x, no_time, queries)
     }
 

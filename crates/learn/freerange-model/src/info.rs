@@ -123,6 +123,10 @@ pub fn tensors(config: &ModelConfig) -> Vec<TensorInfo> {
         linear(&mut out, "dit.t_mlp.0", config.time_features, d);
         linear(&mut out, "dit.t_mlp.2", d, d);
     }
+    if config.cell_channels() > 0 {
+        linear(&mut out, "dit.lift.0", d + config.cell_channels(), d);
+        linear(&mut out, "dit.lift.2", d, d);
+    }
     if config.learned_tokens() > 0 {
         out.push(TensorInfo { name: "dit.latents".to_owned(), shape: vec![config.learned_tokens(), d] });
     }
@@ -194,6 +198,9 @@ impl ModelInfo {
         part("image input", format!("{} to {d}", config.image_token_width()), sum("dit.img_in"));
         let (p, blocks) = (config.gaussians_per_token, config.blocks);
         if config.kind.one_pass() {
+            if config.cell_channels() > 0 {
+                part("views of cells", format!("{} to {d} to {d}", d + config.cell_channels()), sum("dit.lift"));
+            }
             part("learned tokens", format!("{} x {d}", config.learned_tokens()), sum("dit.latents"));
             part("blocks: norms", format!("{blocks} x (4 x {d})"), count(&tensors, ".norms", "dit.blocks"));
         } else {

@@ -7,7 +7,7 @@ use burn::{
 use rand::Rng;
 
 use crate::{
-    Dinov2, Dit, EncoderConfig, Feedback, ImageEncoder, ModelConfig, ModelError, ModelKind,
+    Alignment, Dinov2, Dit, EncoderConfig, Feedback, ImageEncoder, ModelConfig, ModelError, ModelKind,
     compute::Compute,
     layers::{Builder, RandomSource, Source},
     one_pass::Decoder,
@@ -145,13 +145,18 @@ impl FreeRange {
     /// The Gaussians of a model that predicts in one pass: `[b, n, 14]`, normalized for
     /// [latent tokens](ModelKind::LatentTokens), else as they are in the canonical frame.
     ///
-    /// `image_tokens` as [`encode`](Self::encode) gives them; `rays` one Plücker ray per pixel,
-    /// `[b, views, h, w, 6]`, for a [pixel-aligned](ModelKind::PixelAligned) model and no other.
+    /// `image_tokens` as [`encode`](Self::encode) gives them; `alignment` for a model whose Gaussians are bound to pixels
+    /// or cells.
     ///
     /// # Panics
-    /// If this is a model of flow matching, or rays are missing or not wanted.
-    pub fn predict(&self, image_tokens: Tensor<3>, rays: Option<Tensor<5>>) -> Tensor<3> {
-        self.decoder.decode(self.dit.predict(image_tokens), rays)
+    /// If this is a model of flow matching, or the alignment is missing, not wanted or of another kind.
+    pub fn predict(&self, image_tokens: Tensor<3>, alignment: Option<Alignment>) -> Tensor<3> {
+        let (rays, cells) = match alignment {
+            Some(Alignment::Rays(rays)) => (Some(rays), None),
+            Some(Alignment::Cells(cells)) => (None, Some(cells)),
+            None => (None, None),
+        };
+        self.decoder.decode(self.dit.predict(image_tokens, cells), rays)
     }
 
     /// Every trainable tensor, in a fixed order.
@@ -192,9 +197,13 @@ pub(crate) fn check_dinov2(config: &ModelConfig, dinov2: &Dinov2) -> Result<(), 
 /// PyTorch would call these layers of a `Sequential` by number, and our field cannot be called `final`.
 pub(crate) fn torch_name(path: &[String]) -> String {
     let mut name = path.join(".");
-    for (ours, torch) in
-        [("dit.t_mlp.first.", "dit.t_mlp.0."), ("dit.t_mlp.second.", "dit.t_mlp.2."), ("dit.output.", "dit.final.")]
-    {
+    for (ours, torch) in [
+        ("dit.t_mlp.first.", "dit.t_mlp.0."),
+        ("dit.t_mlp.second.", "dit.t_mlp.2."),
+        ("dit.lift.first.", "dit.lift.0."),
+        ("dit.lift.second.", "dit.lift.2."),
+        ("dit.output.", "dit.final."),
+    ] {
         if let Some(rest) = name.strip_prefix(ours) {
             name = format!("{torch}{rest}");
         }

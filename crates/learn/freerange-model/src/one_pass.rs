@@ -2,13 +2,13 @@
 //!
 //! Three of them stand beside flow matching: latent tokens (the paper's "No Flow Matching"), whose rows are normalized
 //! Gaussians as they are; pixel-aligned ones, bounded as GS-LRM's (Zhang et al. 2024); voxel-aligned ones, bounded as
-//! LaRa's (Chen et al. 2024). Lengths are of the canonical frame, in which the object's sphere has the diameter 1. Both
+//! LaRa's (Chen et al. 2024), from what the views show at each cell. Lengths are of the canonical frame, in which the object's sphere has the diameter 1. Both
 //! papers' scenes have twice that, so that their bounds on lengths are halved here.
 
 use burn::tensor::{Tensor, TensorData, activation::sigmoid};
 
 use crate::{
-    ModelConfig, ModelKind, PLUCKER, VolumeConfig,
+    CellViews, ModelConfig, ModelKind, PLUCKER, VolumeConfig,
     config::{CHANNELS, PIXEL_CHANNELS},
     encoder::patches,
 };
@@ -24,6 +24,15 @@ const OPACITY_BIAS: f32 = -2.0;
 pub(crate) const HALF_SIDE: f32 = 0.55;
 /// Largest scale of a voxel-aligned Gaussian, in cells; they begin at half a cell.
 const LARGEST_IN_CELLS: f32 = 2.0;
+
+/// What binds Gaussians to the input views, in a model of one pass.
+#[derive(Clone, Debug)]
+pub enum Alignment {
+    /// One Plücker ray per pixel, `[b, views, h, w, 6]`, of a [pixel-aligned](ModelKind::PixelAligned) model.
+    Rays(Tensor<5>),
+    /// What the views show of each token of a [voxel-aligned](ModelKind::VoxelAligned) model.
+    Cells(CellViews),
+}
 
 /// Turns the rows of tokens into Gaussians. Without weights.
 #[derive(Clone, Debug)]
@@ -96,26 +105,33 @@ fn on_rays(out: Tensor<3>, rays: Tensor<3>) -> Tensor<3> {
 fn in_cells(out: Tensor<3>, volume: &VolumeConfig) -> Tensor<3> {
     let part = |first: usize, count: usize| out.clone().narrow(2, first, count);
     let cell = 2.0 * HALF_SIDE / (volume.tokens_per_side * volume.cells_per_token_side) as f32;
-    let centers = cell_centers(volume);
+    let of_cell = |center| std::iter::repeat_n(center, volume.gaussians_per_cell).flatten();
+    let centers: Vec<f32> = volume.cell_centers().into_iter().flat_map(of_cell).collect();
     let centers = Tensor::<3>::from_data(TensorData::new(centers, [1, out.dims()[1], 3]), &out.device());
     let center = centers + bounded(part(0, 3)) * cell;
     let log_scale = (part(3, 3) + (cell / 2.0).ln()).clamp_max((LARGEST_IN_CELLS * cell).ln());
     Tensor::cat(vec![center, log_scale, rotation(part(6, 4)), part(10, 1) + OPACITY_BIAS, sigmoid(part(11, 3))], 2)
 }
 
-/// The center of each Gaussian's cell, token by token in the order x, y, z with z fastest, its cells likewise. `[n, 3]`
-fn cell_centers(volume: &VolumeConfig) -> Vec<f32> {
-    let &VolumeConfig { tokens_per_side, cells_per_token_side, gaussians_per_cell } = volume;
-    let cell = 2.0 * HALF_SIDE / (tokens_per_side * cells_per_token_side) as f32;
-    let places = |side: usize| (0..side.pow(3)).map(move |i| [i / (side * side), i / side % side, i % side]);
-    let mut out = Vec::new();
-    for token in places(tokens_per_side) {
-        for inner in places(cells_per_token_side) {
-            let center: [f32; 3] = std::array::from_fn(|axis| {
-                ((token[axis] * cells_per_token_side + inner[axis]) as f32 + 0.5) * cell - HALF_SIDE
-            });
-            (0..gaussians_per_cell).for_each(|_| out.extend(center));
-        }
+impl VolumeConfig {
+    /// The center of each token's share in the canonical frame, in the order x, y, z with z fastest.
+    pub fn token_centers(&self) -> Vec<[f32; 3]> {
+        places(self.tokens_per_side).map(|token| Self::center(token, self.tokens_per_side)).collect()
     }
-    out
+
+    /// The center of each cell in the canonical frame, token by token, the cells of a token in the same order as tokens.
+    pub fn cell_centers(&self) -> Vec<[f32; 3]> {
+        let inner = self.cells_per_token_side;
+        let of = |token: [usize; 3]| places(inner).map(move |cell| std::array::from_fn(|i| token[i] * inner + cell[i]));
+        let cells = places(self.tokens_per_side).flat_map(of);
+        cells.map(|cell| Self::center(cell, self.tokens_per_side * inner)).collect()
+    }
+
+    fn center(place: [usize; 3], side: usize) -> [f32; 3] {
+        place.map(|i| (i as f32 + 0.5) * 2.0 * HALF_SIDE / side as f32 - HALF_SIDE)
+    }
+}
+
+fn places(side: usize) -> impl Iterator<Item = [usize; 3]> {
+    (0..side.pow(3)).map(move |i| [i / (side * side), i / side % side, i % side])
 }

@@ -220,14 +220,15 @@ pub fn fid(mut features: impl Iterator<Item = Result<Vec<f32>, EvalError>>) -> R
 /// If features are not finite.
 #[cfg(feature = "networks")]
 pub fn frechet_vgg(renders: &[&[f32]], truths: &[&[f32]]) -> Result<Option<f64>, EvalError> {
-    use crate::metrics::{FeatureStatistics, VGG_WIDTH, frechet_distance};
+    use crate::metrics::{FeatureStatistics, VGG_WIDTH, frechet_distance, frechet_distance_of_few};
     let statistics = |vectors: &[&[f32]]| {
         let mut all = FeatureStatistics::new(VGG_WIDTH);
         vectors.iter().try_for_each(|vector| all.add(vector)).map(|()| all)
     };
-    match renders.len() < 2 {
-        true => Ok(None),
-        false => Ok(Some(frechet_distance(&statistics(renders)?, &statistics(truths)?)?)),
+    match renders.len() {
+        0 | 1 => Ok(None),
+        n if n < VGG_WIDTH && truths.len() < VGG_WIDTH => Ok(Some(frechet_distance_of_few(renders, truths)?)),
+        _ => Ok(Some(frechet_distance(&statistics(renders)?, &statistics(truths)?)?)),
     }
 }
 

@@ -57,7 +57,11 @@ pub(super) fn forward_flops(config: &ModelConfig, workload: Workload) -> f64 {
         true => (0.0, 0.0),
         false => (outputs * config.gaussian_channels() as f64, config.time_features as f64 * d + d * d),
     };
-    let inputs = images * config.image_token_width() as f64 + noisy;
+    let lift = match config.cell_channels() {
+        0 => 0.0,
+        channels => outputs * (workload.views as f64 * (d + channels as f64) + d),
+    };
+    let inputs = images * config.image_token_width() as f64 + noisy + lift;
     let output = outputs * config.output_channels() as f64;
     let block = |queries: f64| {
         let modulation = if config.kind.one_pass() { 0.0 } else { 6.0 * d * d };

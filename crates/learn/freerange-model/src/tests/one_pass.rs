@@ -9,7 +9,8 @@ use rand_chacha::ChaCha8Rng;
 
 use super::{devices, numbers};
 use crate::{
-    CHANNELS, EncoderConfig, FreeRange, ModelConfig, ModelKind, PLUCKER, PatchConfig, VolumeConfig,
+    Alignment, CHANNELS, CellViews, EncoderConfig, FreeRange, ModelConfig, ModelKind, PLUCKER, PatchConfig,
+    VolumeConfig,
     one_pass::{HALF_SIDE, REACH},
 };
 
@@ -59,6 +60,17 @@ fn cross(a: [f32; 3], b: [f32; 3]) -> [f32; 3] {
     std::array::from_fn(|i| a[(i + 1) % 3] * b[(i + 2) % 3] - a[(i + 2) % 3] * b[(i + 1) % 3])
 }
 
+/// Every view shows noise at every cell, and each token's center lies in another patch, or (8) in none.
+fn cells(device: &Device) -> CellViews {
+    let rng = &mut ChaCha8Rng::seed_from_u64(5);
+    let pixels: Vec<f32> = (0..VIEWS * 8 * 32).map(|_| rng.random()).collect();
+    let patches: Vec<i64> = (0..VIEWS as i64 * 8).map(|i| i % 9).collect();
+    CellViews {
+        patches: Tensor::from_data(TensorData::new(patches, [1, VIEWS * 8]), device),
+        pixels: Tensor::from_data(TensorData::new(pixels, [1, VIEWS, 8, 32]), device),
+    }
+}
+
 /// A model all of whose weights are random: those that begin as zeros would hide what comes before them.
 fn model(config: &ModelConfig, device: &Device) -> FreeRange {
     let rng = &mut ChaCha8Rng::seed_from_u64(3);
@@ -78,8 +90,12 @@ fn predict(model: &FreeRange, device: &Device) -> Tensor<3> {
     let images = Tensor::from_data(TensorData::new(pixels, [1, VIEWS, SIDE, SIDE, 4]), device);
     let grid: Vec<f32> = (0..VIEWS * 4 * PLUCKER).map(|_| rng.random::<f32>() - 0.5).collect();
     let grid = Tensor::from_data(TensorData::new(grid, [1, VIEWS, 2, 2, PLUCKER]), device);
-    let rays = (model.kind() == ModelKind::PixelAligned).then(|| rays(device).0);
-    model.predict(model.encode(images, grid), rays)
+    let alignment = match model.kind() {
+        ModelKind::PixelAligned => Some(Alignment::Rays(rays(device).0)),
+        ModelKind::VoxelAligned => Some(Alignment::Cells(cells(device))),
+        _ => None,
+    };
+    model.predict(model.encode(images, grid), alignment)
 }
 
 #[test]

@@ -14,7 +14,7 @@ pub mod weights;
 
 pub use error::MetricsError;
 #[cfg(feature = "networks")]
-pub use frechet::{FeatureStatistics, frechet_distance};
+pub use frechet::{FeatureStatistics, frechet_distance, frechet_distance_of_few};
 pub use metric::Metric;
 #[cfg(feature = "networks")]
 pub use networks::{
