@@ -5,7 +5,7 @@
 
 use burn::{
     module::{Module, Param},
-    tensor::{Device, Int, Tensor, TensorData, activation::silu},
+    tensor::{Device, Tensor, TensorData, activation::silu},
 };
 
 use crate::{
@@ -14,6 +14,7 @@ use crate::{
     config::{CHANNELS, ModelKind, PLACE},
     kernels::block::BlockSettings,
     layers::{Builder, Init, Linear, NormWeight, Source},
+    lift::{CellViews, Lift},
     ops,
 };
 
@@ -23,8 +24,8 @@ pub struct Dit {
     registers: Param<Tensor<2>>, // [registers, d]
     img_in: Linear,
     gs_in: Option<Linear>, // of flow matching, as is the time
-    t_mlp: Option<Mlp>,
-    lift: Option<Mlp>,                 // of voxel-aligned models
+    t_mlp: Option<TimeMlp>,
+    lift: Option<Lift>,                // of voxel-aligned models
     latents: Option<Param<Tensor<2>>>, // learned tokens instead, [tokens, d]
     blocks: Vec<Block>,
     output: Output,
@@ -41,21 +42,10 @@ pub struct Dit {
     recompute: bool,
 }
 
-/// Two layers with a SiLU between them.
 #[derive(Module, Debug)]
-struct Mlp {
+struct TimeMlp {
     first: Linear,
     second: Linear,
-}
-
-/// What each view shows where the tokens of a volume lie.
-#[derive(Clone, Debug)]
-pub struct CellViews {
-    /// Which of an object's image tokens (view by view, row by row) shows the token's center; as many as there are image
-    /// tokens: none. `[b, views * tokens]`
-    pub patches: Tensor<2, Int>,
-    /// The pixel at the center of each of its cells, zeros outside of the image. `[b, views, tokens, cells * channels]`
-    pub pixels: Tensor<4>,
 }
 
 /// What the network is told of the Gaussians besides their noisy selves. What is missing is zeros.
@@ -286,7 +276,7 @@ impl Dit {
                 _ => None,
             },
             t_mlp: match config.kind {
-                ModelKind::FlowMatching => Some(Mlp {
+                ModelKind::FlowMatching => Some(TimeMlp {
                     first: builder.linear(&name("t_mlp.0"), config.time_features, d, Init::Normal(0.02))?,
                     second: builder.linear(&name("t_mlp.2"), d, d, Init::Normal(0.02))?,
                 }),
@@ -294,10 +284,7 @@ impl Dit {
             },
             lift: match config.cell_channels() {
                 0 => None,
-                channels => Some(Mlp {
-                    first: builder.linear(&name("lift.0"), d + channels, d, Init::Xavier)?,
-                    second: builder.linear(&name("lift.2"), d, d, Init::Xavier)?,
-                }),
+                channels => Some(Lift::build(d, channels, &name("lift"), builder)?),
             },
             latents: match config.learned_tokens() {
                 0 => None,
@@ -386,7 +373,7 @@ impl Dit {
     /// # Panics
     /// If the model predicts in one pass: it has no time.
     pub fn condition(&self, t: Tensor<1>) -> Tensor<2> {
-        let Mlp { first, second } = self.t_mlp.as_ref().expect("a model of flow matching");
+        let TimeMlp { first, second } = self.t_mlp.as_ref().expect("a model of flow matching");
         second.forward(silu(first.forward(time_embedding(t, self.time_features))))
     }
 
@@ -432,22 +419,6 @@ impl Dit {
         (image_tokens.dims()[1] > 0).then(|| self.img_in.forward(image_tokens))
     }
 
-    /// What the views show of each token of a volume: an MLP of the image token and the pixels there, its mean over views.
-    /// `images` `[b, m, d]` to `[b, tokens, d]`.
-    fn lifted(&self, images: Tensor<3>, cells: CellViews) -> Tensor<3> {
-        let Mlp { first, second } = self.lift.as_ref().expect("a voxel-aligned model");
-        let ([b, m, d], [_, views, tokens, _]) = (images.dims(), cells.pixels.dims());
-        let device = images.device();
-        let nothing = Tensor::zeros([b, 1, d], &device);
-        let features = Tensor::cat(vec![images, nothing], 1).reshape([b * (m + 1), d]);
-        let starts: Vec<i64> = (0..b).map(|i| (i * (m + 1)) as i64).collect();
-        let starts = Tensor::<1, Int>::from_data(TensorData::new(starts, [b]), &device).reshape([b, 1]);
-        let at = (cells.patches + starts).reshape([b * views * tokens]);
-        let features = features.select(0, at).reshape([b, views, tokens, d]);
-        let seen = silu(first.forward(Tensor::cat(vec![features, cells.pixels], 3)));
-        second.forward(seen.mean_dim(1).reshape([b, tokens, d]))
-    }
-
     /// All blocks, and the output layer on the last `queries` tokens: `[b, queries, output channels]`.
     fn blocks_and_output(&self, mut x: Tensor<3>, silu_c: Tensor<2>, queries: usize) -> Tensor<3> {
         for (i, block) in self.blocks.iter().enumerate() {
@@ -482,10 +453,9 @@ impl Dit {
         let no_time = Tensor::zeros([b, 1], &image_tokens.device());
         let images = self.image_inputs(image_tokens);
         assert_eq!(self.lift.is_some(), cells.is_some(), "views of cells belong to a voxel-aligned model");
-        let latents = match (latents, &images, cells) {
-            (Some(latents), Some(images), Some(cells)) => Some(latents + self.lifted(images.clone(), cells)),
-            (latents, _, _) => latents,
-        };
+        let lifted =
+            self.lift.as_ref().zip(images.clone()).zip(cells).map(|((l, images), cells)| l.forward(images, cells));
+        let latents = latents.into_iter().chain(lifted).reduce(|sum, more| sum + more);
         let x = self.sequence(b, images, latents);
         self.blocks_and_output(x, no_time, queries)
     }

@@ -16,6 +16,7 @@ pub mod hub;
 mod info;
 mod kernels;
 mod layers;
+mod lift;
 mod memory;
 mod model;
 mod one_pass;
@@ -30,11 +31,12 @@ pub use config::{
     CHANNELS, Dinov2Config, EncoderConfig, ModelConfig, ModelKind, OBSERVATION, PLACE, PLUCKER, PatchConfig,
     VolumeConfig,
 };
-pub use dit::{CellViews, Dit, Feedback, time_embedding};
+pub use dit::{Dit, Feedback, time_embedding};
 pub use encoder::{Dinov2, EncoderWeights, ImageEncoder, WeightsOrigin, position_embedding};
 pub use error::ModelError;
 pub use info::{Execution, ModelInfo, PartInfo, TensorInfo, Workload, dinov2_parameters, tensors};
 pub use layers::{Linear, NormWeight};
+pub use lift::CellViews;
 pub use memory::keep_freed_memory;
 pub use model::{FreeRange, Parameter};
 pub use one_pass::Alignment;

@@ -129,7 +129,7 @@ impl Default for OptimizationConfig {
         Self {
             steps: 500,
             gaussians: 8192,
-            rates: Rates { mean: 1.5e-3, scale: 5e-3, ..FitConfig::default().rates },
+            rates: Rates { mean: 1.5e-3, scale: 1e-2, rotation: 2e-3, opacity: 0.1, color: 2.5e-3 },
             render_size: 256,
             coarse: 0.0,
             coarse_size: 256,
@@ -240,15 +240,19 @@ const WINDOW: f64 = 0.6;
 const BESIDE_WINDOWS: f64 = 1.5;
 
 impl OptimizationConfig {
-    /// These settings, which are for up to four photos, for so many: as many steps for each, more of their pixels, up to 512, and less weight of
-    /// anchors, since more of the object is seen. From sixteen photos on nothing changes any more.
+    /// These settings, which are for up to four photos, for so many: as many steps for each, at lower rates, more of their pixels, up to 512, and
+    /// less weight of anchors, since more of the object is seen. From sixteen photos on nothing changes any more.
     #[must_use]
     pub fn for_photos(self, photos: usize) -> Self {
         let photos = photos.clamp(PHOTOS, MOST_PHOTOS);
         let more = photos as f64 / PHOTOS as f64;
         let grown = |size: u32| ((f64::from(size) * more.sqrt()).round() as u32).min(size.max(MOST_GROWN));
+        let Rates { mean, scale, rotation, opacity, color } = self.rates;
+        let slower = more.sqrt();
         Self {
             steps: self.steps * photos / PHOTOS,
+            // Fast rates make up for few steps. Sixteen photos have enough of them.
+            rates: Rates { mean, scale: scale / slower, rotation: rotation / slower, opacity: opacity / slower, color },
             render_size: grown(self.render_size),
             anchors: AnchorConfig { weight: self.anchors.weight / more.powf(1.5), ..self.anchors },
             ..self
@@ -317,6 +321,9 @@ mod tests {
         assert!((eight.anchors.weight - 0.1 / 8f64.sqrt()).abs() < 1e-12);
         let sixteen = config.clone().for_photos(16);
         assert_eq!((sixteen.steps, sixteen.render_size, sixteen.anchors.weight), (2000, 512, 0.1 / 8.0));
+        let usual = Rates { mean: 1.5e-3, scale: 5e-3, rotation: 1e-3, opacity: 0.05, color: 2.5e-3 };
+        assert_eq!(sixteen.rates, usual, "those of 3DGS, but for centers");
+        assert!((eight.rates.scale / usual.scale - 2f64.sqrt()).abs() < 1e-12);
         assert_eq!(config.clone().for_photos(usize::MAX), sixteen);
         // What is as large already stays.
         let detailed = config.clone().detailed(2, 4000).for_photos(8);
