@@ -27,6 +27,7 @@ const LARGEST_IN_CELLS: f32 = 2.0;
 
 /// What binds Gaussians to the input views, in a model of one pass.
 #[derive(Clone, Debug)]
+#[expect(clippy::large_enum_variant, reason = "one per batch")]
 pub enum Alignment {
     /// One Plücker ray per pixel, `[b, views, h, w, 6]`, of a [pixel-aligned](ModelKind::PixelAligned) model.
     Rays(Tensor<5>),
