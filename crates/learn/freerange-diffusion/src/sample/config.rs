@@ -7,7 +7,7 @@ use crate::coupling::Coupling;
 
 /// Number of the meaning of settings in records: of a pipeline, a sampler, fits and optimization. Raise it whenever the same
 /// recorded settings come to mean another computation, or a default changes: results of different numbers are never mixed.
-pub const SETTINGS_SCHEMA: u32 = 4;
+pub const SETTINGS_SCHEMA: u32 = 5;
 
 /// Settings of a [`FlowSampler`](super::FlowSampler); the defaults are the paper's. Records hold every field.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
@@ -162,7 +162,7 @@ mod tests {
     /// where records of this one are read ([`Settings`](crate::settings::Settings)).
     #[test]
     fn defaults_are_those_of_their_schema() {
-        assert_eq!(SETTINGS_SCHEMA, 4);
+        assert_eq!(SETTINGS_SCHEMA, 5);
         let flow = serde_json::json!({
             "steps": 50, "lod_depth": null, "cfg_scale": 2.0, "lambda_pg": 50.0, "gradient_at": "noisy",
             "gradient_size": 512, "background": "random", "coupling": "independent", "compute": "f32"
