@@ -61,7 +61,7 @@ held_views = 2
 render_size = 32
 
 [optimizer]
-learning_rate = 3e-3
+learning_rate = 1e-3
 final_learning_rate = 1e-4
 warmup = 10
 ema = 0.9
@@ -102,7 +102,7 @@ fn views(config: &TrainConfig) -> (Vec<View>, Vec<View>) {
 #[test]
 fn each_kind_learns_an_object() {
     // Until it has found where to be opaque, a model of many faint Gaussians is best when it shows nothing.
-    for (kind, steps) in KINDS.into_iter().zip([100, 200, 400]) {
+    for (kind, steps) in KINDS.into_iter().zip([100, 200, 300]) {
         let config = config(kind, steps);
         config.validate().unwrap();
         let folder = tempfile::tempdir().unwrap();
