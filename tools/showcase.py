@@ -1,6 +1,6 @@
 """Objects in rows: input photos, further photos, and renders of the result beneath them (docs/images/showcase.png).
 
-usage: showcase.py [--compare] OUT SCENE=RESULT [SCENE=RESULT ...]
+usage: showcase.py [--compare | --print] OUT SCENE=RESULT [SCENE=RESULT ...]
 SCENE is a scene folder with transforms_full.json and transforms_val.json; RESULT holds what `freerange reconstruct
 SCENE/transforms_full.json -o RESULT/out` and `freerange render RESULT/out/gaussians.ply --cameras SCENE/transforms_val.json
 -o RESULT/renders` wrote. Needs Pillow. Writes OUT.png.
@@ -9,6 +9,9 @@ SCENE/transforms_full.json -o RESULT/out` and `freerange render RESULT/out/gauss
 writes OUT.jpg. RESULT/out was made with --eval-scene
 SCENE/transforms_val.json; RESULT/fit holds what `freerange render RESULT/fit.ply --cameras SCENE/transforms_val.json -o RESULT/fit`
 wrote of the baseline: `cargo run --release -p freerange-cli --example baseline -- SCENE/transforms_full.json RESULT/fit.ply`.
+
+--print: as --compare, and in two lines per object: the whole view, and its middle enlarged (docs/images/print.jpg). A column
+"before" shows RESULT/before, the renders of an earlier result, where there is one.
 """
 import json
 import pathlib
@@ -75,13 +78,45 @@ def compare(out, pairs):
     sheet.save(out + ".jpg", quality=88, optimize=True)
 
 
+def middle(path, size):
+    """A third of each side about the middle of the object, enlarged; never smoothed by shrinking."""
+    image = Image.open(path).convert("RGBA")
+    white = Image.new("RGBA", image.size, (255, 255, 255, 255))
+    image = Image.alpha_composite(white, image).convert("RGB")
+    part = image.width // 3
+    left, top = (image.width - part) // 2, (image.height - part) // 2
+    return image.crop((left, top, left + part, top + part)).resize((size, size), Image.LANCZOS)
+
+
+def prints(out, pairs):
+    """Rows of: four input photos, the baseline fit, the result before, the result, the ground truth; the median view."""
+    size, label = 2 * INPUT + GAP, 22
+    columns = [("fit", "3DGS-MCMC fit"), ("before", "before"), ("renders", "now")]
+    columns = [(folder, title) for folder, title in columns if all((result / folder).is_dir() for _, result in pairs)]
+    titles = ["4 input photos", *(title for _, title in columns), "ground truth"]
+    sheet = Image.new("RGB", (len(titles) * (size + 3 * GAP) - 3 * GAP, label + len(pairs) * 2 * (size + GAP)), (255, 255, 255))
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=15)
+    for column, title in enumerate(titles):
+        draw.text((column * (size + 3 * GAP) + size // 2, 2), title, fill=(0, 0, 0), font=font, anchor="ma")
+    for row, (scene, result) in enumerate(pairs):
+        top = label + row * 2 * (size + GAP)
+        for i, file in enumerate(photos(scene, "transforms_full.json")[:4]):
+            sheet.paste(over_white(file, INPUT), ((i % 2) * (INPUT + GAP), top + i // 2 * (INPUT + GAP)))
+        view = median_view(result)
+        files = [sorted((result / folder).glob("*.png"))[view] for folder, _ in columns]
+        for column, file in enumerate((*files, photos(scene, "transforms_val.json")[view]), 1):
+            sheet.paste(over_white(file, size), (column * (size + 3 * GAP), top))
+            sheet.paste(middle(file, size), (column * (size + 3 * GAP), top + size + GAP))
+    sheet.save(out + ".jpg", quality=85, optimize=True)
+
+
 def main():
     arguments = sys.argv[1:]
-    labeled = arguments[0] == "--compare"
+    labeled = {"--compare": compare, "--print": prints}.get(arguments[0])
     out, *rest = arguments[1:] if labeled else arguments
     pairs = [tuple(map(pathlib.Path, a.split("="))) for a in rest]
     if labeled:
-        compare(out, pairs)
+        labeled(out, pairs)
         return
     rows = [row(*pair) for pair in pairs]
     sheet = Image.new("RGB", (rows[0].width, sum(r.height for r in rows) + 4 * GAP * (len(rows) - 1)), (255, 255, 255))

@@ -67,7 +67,7 @@ evaluate() {
   fi
   [ -z "${WEIGHTS:-}" ] || from+=(--weights "$WEIGHTS")
   [ -z "$checkpoint" ] || from+=(--checkpoint "$checkpoint")
-  "$binary" eval --pictures none "${from[@]}" -o "$to" "$@"
+  "$binary" eval --pictures none --precision f32 "${from[@]}" -o "$to" "$@"
 }
 
 # tables ROW: the tables so far, of PLACE/tables: links to the rows of PLACE, and to kept ones where PLACE has none.

@@ -18,12 +18,12 @@ use crate::{
 pub struct PipelineArgs {
     /// Preset of quality and time.
     ///
-    /// Steps are for up to four photos. With five to sixteen photos their number grows in proportion, up to four times.
+    /// Steps are for up to four photos. With five to sixteen photos their number grows, up to five times.
     #[arg(long, value_enum, default_value = "default")]
     pub quality: QualityName,
-    /// Optimization steps on the photos; 0 returns the network's Gaussians [default: of the preset, 500].
+    /// Optimization steps on the photos; 0 returns the network's Gaussians [default: of the preset, 400].
     ///
-    /// For up to four photos. With five to sixteen photos the number grows in proportion, up to four times.
+    /// For up to four photos. With five to sixteen photos the number grows, up to five times.
     #[arg(long, value_name = "STEPS")]
     pub iterations: Option<usize>,
     /// Detect mirror planes and axes of revolution [default: auto; off in draft].
@@ -63,7 +63,7 @@ pub struct PipelineArgs {
         help_heading = "Model and device"
     )]
     pub encoder_weights: Option<PathBuf>,
-    /// Precision of the network: f32, bf16, f16, or auto for the faster of the first two [default: f32, or the checkpoint's].
+    /// Precision of the network: f32, bf16, f16, or auto for bf16 where the device has it, else f32 [default: auto, or the checkpoint's].
     #[arg(long, value_parser = parse_precision, hide_short_help = true, help_heading = "Model and device")]
     pub precision: Option<Compute>,
     /// Device: auto, cpu, cuda, metal, vulkan or webgpu, with a number as in cuda:1.
@@ -74,11 +74,11 @@ pub struct PipelineArgs {
 /// Presets of quality and time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum QualityName {
-    /// One proposal, no symmetry, 150 steps at 256 pixels (600 at 512 pixels from 16 photos on).
+    /// One proposal, no symmetry, 150 steps at 256 pixels (750 at 512 pixels from 16 photos on).
     Draft,
-    /// The setting of the main results: 500 steps at up to 512 pixels (2,000 from 16 photos on).
+    /// The setting of the main results: 400 steps at up to 512 pixels (2,000 from 16 photos on).
     Default,
-    /// Twice the optimization steps: 1,000 (4,000 from 16 photos on).
+    /// Twice the optimization steps: 800 (4,000 from 16 photos on).
     High,
 }
 

@@ -1,6 +1,7 @@
 //! What a checkpoint says of its own use, as types: `network_views`, `sample`, `refiner` and their schema number in the
 //! checkpoint's metadata.
 
+use freerange_model::Compute;
 use freerange_util::Invalid;
 use serde_json::{Value, json};
 
@@ -20,6 +21,8 @@ pub struct Settings {
     pub refiner: Option<RefinerConfig>,
 }
 
+/// The schema since which the default precision is automatic. Before, f32 was recorded where nobody had chosen.
+const AUTOMATIC: u64 = 6;
 /// The paper's number of input views.
 const PAPERS_VIEWS: usize = 4;
 
@@ -36,7 +39,7 @@ impl Settings {
             let found = schema.map_or_else(String::new, ToString::to_string);
             return Err(Invalid::new(field("settings_schema"), expected, found).into());
         };
-        let (sample, refiner) = match (provenance.get("sample"), number) {
+        let (mut sample, mut refiner) = match (provenance.get("sample"), number) {
             (None, _) => (FlowConfig::default(), None),
             (Some(value), 1) => converted(value)?,
             (Some(value), _) => {
@@ -44,6 +47,12 @@ impl Settings {
                 (parsed("sample", value)?, refiner.map(|r| parsed("refiner", r)).transpose()?)
             }
         };
+        if number < AUTOMATIC {
+            let of_refiner = refiner.as_mut().map(|r| &mut r.compute);
+            std::iter::once(&mut sample.compute).chain(of_refiner).filter(|c| **c == Compute::F32).for_each(|c| {
+                *c = Compute::Auto;
+            });
+        }
         sample.validate().map_err(|e| e.within(&field("sample")))?;
         refiner.as_ref().map_or(Ok(()), RefinerConfig::validate).map_err(|e| e.within(&field("refiner")))?;
         let views = provenance.get("network_views").or_else(|| provenance.pointer("/configuration/loss/input_views/1"));
@@ -160,6 +169,15 @@ mod tests {
         assert_eq!((refiner.gradient_size, found.sample.gradient_size), (128, 128));
         assert_eq!((found.sample.steps, found.sample.cfg_scale, found.sample.lambda_pg), (40, 1.0, LAMBDA_PG));
         assert_eq!(found.sample.background, FlowConfig::default().background);
+
+        // Automatic since schema 6, when f32 became a choice.
+        assert_eq!((refiner.compute, found.sample.compute), (Compute::Auto, Compute::Auto));
+        for (schema, expected) in [(5, Compute::Auto), (6, Compute::F32)] {
+            let record =
+                json!({ "settings_schema": schema, "sample": { "compute": "f32" }, "refiner": { "compute": "f32" } });
+            let Settings { sample, refiner, .. } = Settings::of(&record).unwrap();
+            assert_eq!((sample.compute, refiner.unwrap().compute), (expected, expected));
+        }
 
         let paper = Settings::of(&json!({ "sample": { "cfg_scale": 1.5, "steps": 20 } })).unwrap();
         assert_eq!((paper.sample.cfg_scale, paper.sample.lambda_pg, paper.sample.steps), (1.5, 50.0, 20));

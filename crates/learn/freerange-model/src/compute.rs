@@ -17,7 +17,7 @@ pub enum Compute {
     Bf16,
     /// In f16, on GPUs without bf16. For inference: small gradients vanish. On a CPU: f32.
     F16,
-    /// In bf16 where that is faster, else in f32: see [`Compute::on`].
+    /// In bf16 where the device has it, else in f32: see [`Compute::on`].
     Auto,
 }
 

@@ -3,8 +3,6 @@
 //! Each has two implementations: [`reference`], a few lines of tensor operations that say what is computed, and
 //! [`crate::kernels`], fused, with hand-written gradients. Tests hold the second to the first.
 
-use std::{sync::OnceLock, time::Instant};
-
 use burn::{
     backend::Dispatch,
     tensor::{Device, FloatDType, Tensor},
@@ -16,43 +14,17 @@ use crate::kernels::{
     block::{BlockSettings, Weights},
 };
 
-/// How much faster bf16 has to be for [`Compute::Auto`]: it rounds.
-const WORTHWHILE: f64 = 1.2;
-
 impl Compute {
-    /// What [`Auto`](Self::Auto) means on a device; the others mean themselves. A GPU that has bf16 computes in it. On a CPU a
-    /// product is timed both ways, once per process (some processors have instructions for bf16 that are slower than those
-    /// for f32).
+    /// What [`Auto`](Self::Auto) means on a device; the others mean themselves: bf16 on a GPU that has it, and on a CPU with
+    /// Intel's tiles or AVX-512 BF16 instructions, else f32. The same on the same machine always, however busy it is.
     pub fn on(self, device: &Device) -> Self {
         match self {
-            Self::Auto if is_cpu(device) => match cpu_ratio() > WORTHWHILE {
-                true => Self::Bf16,
-                false => Self::F32,
-            },
-            Self::Auto if Self::Bf16.supported(device) => Self::Bf16,
+            Self::Auto if is_cpu(device) && crate::kernels::cpu_has_bf16() => Self::Bf16,
+            Self::Auto if !is_cpu(device) && Self::Bf16.supported(device) => Self::Bf16,
             Self::Auto => Self::F32,
             chosen => chosen,
         }
     }
-}
-
-/// How many times as fast as in f32 this CPU multiplies in bf16: the better of a few products of a small model's size.
-fn cpu_ratio() -> f64 {
-    static RATIO: OnceLock<f64> = OnceLock::new();
-    *RATIO.get_or_init(|| {
-        let ones = |shape: [usize; 2]| Tensor::<2>::ones(shape, &Device::flex());
-        let (x, w, b) =
-            (ones([1, 512 * 384]).reshape([1, 512, 384]), ones([1152, 384]), Tensor::ones([1152], &Device::flex()));
-        let best = |compute: Compute| {
-            let once = || {
-                let begin = Instant::now();
-                linear(x.clone(), w.clone(), b.clone(), compute).into_data();
-                begin.elapsed().as_secs_f64()
-            };
-            (0..6).map(|_| once()).fold(f64::INFINITY, f64::min)
-        };
-        best(Compute::F32) / best(Compute::Bf16)
-    })
 }
 
 /// As activations between operations are on a GPU.
@@ -204,7 +176,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_automatic_is_chosen_once() {
+    fn what_is_automatic_is_chosen_by_the_device() {
         let device = Device::flex();
         for chosen in [Compute::F32, Compute::Bf16, Compute::F16] {
             assert_eq!(chosen.on(&device), chosen);
@@ -212,7 +184,7 @@ mod tests {
         let found = Compute::Auto.on(&device);
         assert!([Compute::F32, Compute::Bf16].contains(&found) && found.supported(&device));
         assert_eq!(Compute::Auto.on(&device.autodiff()), found);
-        assert_eq!(found == Compute::Bf16, cpu_ratio() > WORTHWHILE);
+        assert_eq!(found == Compute::Bf16, crate::kernels::cpu_has_bf16());
         for name in ["f32", "bf16", "f16", "auto"] {
             let compute: Compute = serde_json::from_value(name.into()).unwrap();
             assert_eq!(compute.to_string(), name);

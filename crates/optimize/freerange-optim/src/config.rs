@@ -108,7 +108,8 @@ pub struct OptimizationConfig {
     pub steps: usize,
     /// Number of Gaussians at the end; a cloud that has more keeps its number.
     pub gaussians: usize,
-    /// Learning rates at the start.
+    /// Learning rates of 2,000 steps or more, at the start. Of fewer steps, scale, rotation and opacity have higher ones: up to
+    /// three times these, for 400 steps or less.
     pub rates: Rates,
     /// Longest side, in pixels, at which views are compared; larger ones are shrunk.
     pub render_size: u32,
@@ -127,9 +128,9 @@ pub struct OptimizationConfig {
 impl Default for OptimizationConfig {
     fn default() -> Self {
         Self {
-            steps: 500,
+            steps: 400,
             gaussians: 8192,
-            rates: Rates { mean: 1.5e-3, scale: 1e-2, rotation: 2e-3, opacity: 0.1, color: 2.5e-3 },
+            rates: Rates { mean: 1.5e-3, scale: 5e-3, rotation: 1e-3, opacity: 0.05, color: 2.5e-3 },
             render_size: 256,
             coarse: 0.0,
             coarse_size: 256,
@@ -224,9 +225,26 @@ const GROWTH_STOP: f64 = 5.0 / 6.0;
 /// Learning rate of the centers at the end of an optimization, reached exponentially. The others are constant.
 const FINAL_MEAN_RATE: f64 = 1.5e-5;
 
+/// Steps of an optimization up to which scale, rotation and opacity have `HASTE` times their learning rates, and from which
+/// on they have these. Fast rates make up for few steps (docs/research/experiments/optimization.md).
+const SHORT: f64 = 400.0;
+const LONG: f64 = 2000.0;
+const HASTE: f64 = 3.0;
+
+impl Rates {
+    fn hastened(self, steps: usize) -> Self {
+        let Self { mean, scale, rotation, opacity, color } = self;
+        let short = ((LONG / steps.max(1) as f64).ln() / (LONG / SHORT).ln()).clamp(0.0, 1.0);
+        let haste = HASTE.powf(short);
+        Self { mean, scale: haste * scale, rotation: haste * rotation, opacity: haste * opacity, color }
+    }
+}
+
 /// Photos that the defaults of an optimization are for, and those from which on more change nothing.
 const PHOTOS: usize = 4;
 const MOST_PHOTOS: usize = 16;
+/// Times as many steps as for few photos.
+const MOST_STEPS: f64 = 5.0;
 
 /// Up to so many pixels, the longest side, pictures grow with the number of photos.
 const MOST_GROWN: u32 = 512;
@@ -240,19 +258,15 @@ const WINDOW: f64 = 0.6;
 const BESIDE_WINDOWS: f64 = 1.5;
 
 impl OptimizationConfig {
-    /// These settings, which are for up to four photos, for so many: as many steps for each, at lower rates, more of their pixels, up to 512, and
-    /// less weight of anchors, since more of the object is seen. From sixteen photos on nothing changes any more.
+    /// These settings, which are for up to four photos, for so many: more steps, five times as many for sixteen, more of their pixels, up
+    /// to 512, and less weight of anchors, since more of the object is seen. From sixteen photos on nothing changes any more.
     #[must_use]
     pub fn for_photos(self, photos: usize) -> Self {
         let photos = photos.clamp(PHOTOS, MOST_PHOTOS);
-        let more = photos as f64 / PHOTOS as f64;
+        let [more, most] = [photos, MOST_PHOTOS].map(|n| n as f64 / PHOTOS as f64);
         let grown = |size: u32| ((f64::from(size) * more.sqrt()).round() as u32).min(size.max(MOST_GROWN));
-        let Rates { mean, scale, rotation, opacity, color } = self.rates;
-        let slower = more.sqrt();
         Self {
-            steps: self.steps * photos / PHOTOS,
-            // Fast rates make up for few steps. Sixteen photos have enough of them.
-            rates: Rates { mean, scale: scale / slower, rotation: rotation / slower, opacity: opacity / slower, color },
+            steps: (self.steps as f64 * MOST_STEPS.powf(more.ln() / most.ln())).round() as usize,
             render_size: grown(self.render_size),
             anchors: AnchorConfig { weight: self.anchors.weight / more.powf(1.5), ..self.anchors },
             ..self
@@ -297,7 +311,7 @@ impl OptimizationConfig {
             growth_stop: GROWTH_STOP,
             // One Gaussian more, since rounds round down.
             growth: (most as f64 / start as f64).powf(1.0 / f64::from(rounds)) + 1.0 / start as f64,
-            rates: self.rates,
+            rates: self.rates.hastened(self.steps),
             final_mean_rate: FINAL_MEAN_RATE,
             render_size: Some(self.render_size),
             seed: self.seed,
@@ -317,18 +331,29 @@ mod tests {
             assert_eq!(config.clone().for_photos(photos), config);
         }
         let eight = config.clone().for_photos(8);
-        assert_eq!((eight.steps, eight.render_size), (1000, 362));
+        assert_eq!((eight.steps, eight.render_size), (894, 362));
         assert!((eight.anchors.weight - 0.1 / 8f64.sqrt()).abs() < 1e-12);
         let sixteen = config.clone().for_photos(16);
         assert_eq!((sixteen.steps, sixteen.render_size, sixteen.anchors.weight), (2000, 512, 0.1 / 8.0));
-        let usual = Rates { mean: 1.5e-3, scale: 5e-3, rotation: 1e-3, opacity: 0.05, color: 2.5e-3 };
-        assert_eq!(sixteen.rates, usual, "those of 3DGS, but for centers");
-        assert!((eight.rates.scale / usual.scale - 2f64.sqrt()).abs() < 1e-12);
         assert_eq!(config.clone().for_photos(usize::MAX), sixteen);
         // What is as large already stays.
         let detailed = config.clone().detailed(2, 4000).for_photos(8);
-        assert_eq!((detailed.steps, detailed.render_size, detailed.gaussians), (1000, 512, 16_384));
+        assert_eq!((detailed.steps, detailed.render_size, detailed.gaussians), (894, 512, 16_384));
         assert_eq!(config.clone().detailed(4, 4000).for_photos(16).render_size, 1024);
+    }
+
+    #[test]
+    fn few_steps_have_faster_rates() {
+        let of = |steps: usize| OptimizationConfig { steps, ..OptimizationConfig::default() }.fit(1000).rates;
+        let usual = Rates { mean: 1.5e-3, scale: 5e-3, rotation: 1e-3, opacity: 0.05, color: 2.5e-3 };
+        assert_eq!((of(2000), of(100_000)), (usual, usual), "those of 3DGS, but for centers");
+        for (steps, times) in [(1, 3.0), (400, 3.0), (894, 3f64.sqrt()), (1999, 1.0)] {
+            let Rates { mean, scale, rotation, opacity, color } = of(steps);
+            assert_eq!((mean, color), (usual.mean, usual.color));
+            for (found, usual) in [(scale, usual.scale), (rotation, usual.rotation), (opacity, usual.opacity)] {
+                assert!((found / usual - times).abs() < 2e-3, "{steps}: {}", found / usual);
+            }
+        }
     }
 
     #[test]
@@ -340,11 +365,11 @@ mod tests {
         let two = config.clone().detailed(2, 512);
         assert_eq!(
             (two.steps, two.gaussians, two.render_size, two.anchors.weight),
-            (500, 16_384, 512, 1.5 * 0.1 / 2.0)
+            (400, 16_384, 512, 1.5 * 0.1 / 2.0)
         );
         assert_eq!((two.coarse, two.coarse_size, two.window), (0.6, 256, 0.6));
         let four = config.clone().detailed(4, 4000);
-        assert_eq!((four.steps, four.gaussians, four.render_size, four.coarse_size), (1000, 32_768, 1024, 512));
+        assert_eq!((four.steps, four.gaussians, four.render_size, four.coarse_size), (800, 32_768, 1024, 512));
         assert_eq!(four.anchors.weight, 1.5 * 0.1 / 4.0);
         // No more than photos show.
         assert_eq!(config.clone().detailed(4, 512), two);
@@ -387,7 +412,7 @@ mod tests {
     /// However few the steps and large the start, the fit is possible and its growth reaches the number asked for.
     #[test]
     fn an_optimization_grows_to_its_number() {
-        for (steps, start) in [(500, 1024), (1, 1024), (20, 1), (1000, 5000), (7, 3)] {
+        for (steps, start) in [(400, 1024), (1, 1024), (20, 1), (1000, 5000), (7, 3)] {
             let config = OptimizationConfig { steps, ..Default::default() };
             let fit = config.fit(start);
             fit.check().unwrap();

@@ -5,8 +5,6 @@ use std::collections::BTreeMap;
 use freerange_gaussians::Gaussians;
 use freerange_optim::meshing::{MeshConfig, Shape, SurfaceError, mesh_of};
 use glam::Vec3;
-use rand::{Rng, SeedableRng};
-use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
 use crate::{EvalError, MeshSurface, statistics::mean};
@@ -43,13 +41,13 @@ fn surface_of(shape: &Shape) -> MeshSurface {
 /// `None` if nothing of the true surface can be seen.
 fn compare(found: &MeshSurface, truth: &MeshSurface) -> Option<BTreeMap<String, f64>> {
     let diameter = diameter(truth);
-    let samples = sample(truth);
+    let samples = truth.samples(POINTS);
     let visible: Vec<Vec3> = samples
         .into_par_iter()
         .filter(|(p, normal)| is_visible(truth, *p, *normal, diameter))
         .map(|(p, _)| p)
         .collect();
-    let of_found: Vec<Vec3> = sample(found).into_iter().map(|(p, _)| p).collect();
+    let of_found: Vec<Vec3> = found.samples(POINTS).into_iter().map(|(p, _)| p).collect();
     let distances = |points: &[Vec3], to: &MeshSurface| -> Vec<f64> {
         points.par_iter().map(|p| f64::from(to.nearest(*p).distance.abs() / diameter)).collect()
     };
@@ -71,23 +69,6 @@ fn diameter(surface: &MeshSurface) -> f32 {
     let points = || surface.triangles().iter().flatten();
     let (low, high) = points().fold((Vec3::INFINITY, Vec3::NEG_INFINITY), |(l, h), p| (l.min(*p), h.max(*p)));
     2.0 * points().map(|p| p.distance(0.5 * (low + high))).fold(0.0, f32::max)
-}
-
-/// Points spread evenly over a surface by area, the same ones each time, with the unit normals of their triangles.
-fn sample(surface: &MeshSurface) -> Vec<(Vec3, Vec3)> {
-    let mut sum = 0.0;
-    let area = |[a, b, c]: &[Vec3; 3]| 0.5 * f64::from((b - a).cross(c - a).length());
-    let until: Vec<f64> = surface.triangles().iter().map(|t| (sum += area(t), sum).1).collect();
-    let mut rng = ChaCha8Rng::seed_from_u64(0);
-    let point = |i: usize| {
-        // One in each of equal parts of the area: less noise than with all of them drawn apart.
-        let at = sum * (i as f64 + rng.random::<f64>()) / POINTS as f64;
-        let [a, b, c] = surface.triangles()[until.partition_point(|u| *u < at).min(until.len() - 1)];
-        let (u, v): (f32, f32) = (rng.random(), rng.random());
-        let (u, v) = if u + v > 1.0 { (1.0 - u, 1.0 - v) } else { (u, v) };
-        (a + u * (b - a) + v * (c - a), (b - a).cross(c - a).normalize_or_zero())
-    };
-    (0..POINTS).map(point).collect()
 }
 
 /// Whether a point of a surface can be seen from far away, on either side.

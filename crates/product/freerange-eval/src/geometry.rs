@@ -13,6 +13,8 @@ use obvhs::{
     ray::Ray,
     triangle::Triangle,
 };
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
 use crate::{EvalError, statistics::quantile};
@@ -62,6 +64,27 @@ impl MeshSurface {
     /// The corners of its triangles, in no particular order.
     pub(crate) fn triangles(&self) -> &[[Vec3; 3]] {
         &self.triangles
+    }
+
+    /// Its area.
+    pub fn area(&self) -> f64 {
+        self.triangles.iter().map(area).sum()
+    }
+
+    /// Points spread evenly over it by area, the same ones each time, with the unit normals of their triangles.
+    pub fn samples(&self, count: usize) -> Vec<(Vec3, Vec3)> {
+        let mut sum = 0.0;
+        let until: Vec<f64> = self.triangles.iter().map(|t| (sum += area(t), sum).1).collect();
+        let mut rng = ChaCha8Rng::seed_from_u64(0);
+        let point = |i: usize| {
+            // One in each of equal parts of the area: less noise than with all of them drawn apart.
+            let at = sum * (i as f64 + rng.random::<f64>()) / count as f64;
+            let [a, b, c] = self.triangles[until.partition_point(|u| *u < at).min(until.len() - 1)];
+            let (u, v): (f32, f32) = (rng.random(), rng.random());
+            let (u, v) = if u + v > 1.0 { (1.0 - u, 1.0 - v) } else { (u, v) };
+            (a + u * (b - a) + v * (c - a), (b - a).cross(c - a).normalize_or_zero())
+        };
+        (0..count).map(point).collect()
     }
 
     /// The nearest point of the surface.
@@ -115,6 +138,10 @@ impl MeshSurface {
         };
         self.bvh.ray_traverse_miss(ray, hit)
     }
+}
+
+fn area([a, b, c]: &[Vec3; 3]) -> f64 {
+    0.5 * f64::from((b - a).cross(c - a).length())
 }
 
 /// The point of a triangle that is nearest to another point, and the triangle's unit normal. In f64: the normal of a sliver is lost in f32.

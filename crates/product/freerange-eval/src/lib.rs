@@ -7,6 +7,7 @@
 //! Architecture invariant: how Gaussians are made is not known here.
 
 pub mod ablation;
+mod agreement;
 mod chamfer;
 pub mod compare;
 pub mod document;
@@ -27,6 +28,7 @@ pub mod statistics;
 mod strip;
 pub mod table;
 
+pub use agreement::agreement;
 pub use chamfer::mesh_metrics;
 pub use error::EvalError;
 pub use folder::{Features, RunFolder, differences};

@@ -178,6 +178,8 @@ const SURFACE: &str = "surface-";
 /// Those of [`mesh_metrics`](crate::mesh_metrics): parts of the object's diameter, or a share.
 const MESH: &str = "mesh-";
 const F_SCORE: &str = "mesh-f-score";
+/// That of [`agreement`](crate::agreement()).
+pub const AGREEMENT: &str = "agreement";
 
 /// How a metric of this name is written in tables: label, factor, decimals. Those of the paper where it has the metric.
 pub fn style(name: &str) -> (String, f64, usize) {
@@ -189,6 +191,7 @@ pub fn style(name: &str) -> (String, f64, usize) {
             (format!("{label} x100"), 100.0, 2)
         }
         Some(Metric::LpipsAlex | Metric::LpipsVgg) => (format!("{label} x1000"), 1000.0, 1),
+        None if name == AGREEMENT => (label, 1.0, 3),
         None if name == F_SCORE => (format!("{name} x100"), 100.0, 2),
         None if name.starts_with(SURFACE) || name.starts_with(MESH) => (format!("{name} x1000"), 1000.0, 1),
         Some(Metric::Psnr) => ("PSNR dB".into(), 1.0, 2),
@@ -201,7 +204,7 @@ pub fn higher_is_better(name: &str) -> Option<bool> {
     match name {
         "seconds" => Some(false),
         // A signed distance is neither.
-        F_SCORE => Some(true),
+        AGREEMENT | F_SCORE => Some(true),
         _ if name.starts_with(SURFACE) || name.starts_with(MESH) => (!name.ends_with("-signed")).then_some(false),
         _ => name.parse::<Metric>().ok().map(Metric::higher_is_better),
     }

@@ -10,11 +10,13 @@ use glam::DMat4;
 use serde_json::Value;
 
 use crate::{
-    Environment, EvalError, EvalObject, Features, Pair, Report, RunFolder, Scorer, document,
+    Environment, EvalError, EvalObject, Features, MeshSurface, Pair, Report, RunFolder, Scorer, agreement, document,
     html::{Embed, html},
     memory::{peak_memory, reset_peak_memory},
     mesh_metrics,
-    record::{Case, Measured, Outcome, Record, SampleScores, VggFeatures, ViewScores, ViewSet, means, style},
+    record::{
+        AGREEMENT, Case, Measured, Outcome, Record, SampleScores, VggFeatures, ViewScores, ViewSet, means, style,
+    },
     statistics::deviation,
     strip, surface_metrics,
 };
@@ -39,11 +41,11 @@ pub trait Method {
     /// What it is called in tables.
     fn label(&self) -> String;
 
-    /// Gaussians for the input views of a case.
+    /// Gaussians for the input views of a case. `truth` is the object's surface, if that is known: for an upper bound only.
     ///
     /// # Errors
     /// Why there are none: what the case's record will say.
-    fn make(&self, case: &Case, inputs: &[View]) -> Result<Reconstructed, String>;
+    fn make(&self, case: &Case, inputs: &[View], truth: Option<&MeshSurface>) -> Result<Reconstructed, String>;
 }
 
 /// What a method gave.
@@ -174,7 +176,7 @@ fn measure_case(run: &Run, case: &Case, object: &EvalObject, shared: &Shared) ->
     // A peak that is not this case's own is no answer.
     let can_measure = reset_peak_memory();
     let begin = Instant::now();
-    let made = match run.method.make(case, &inputs) {
+    let made = match run.method.make(case, &inputs, object.surface()) {
         Ok(made) => made,
         Err(reason) => return failed(reason),
     };
@@ -226,6 +228,8 @@ fn score(found: &Reconstructed, object: &EvalObject, inputs: &[View], shared: &S
         (_, Some(first)) => Some(strip(inputs, &validation, first)?),
     };
     let (mut metrics, mut notes) = (means(&samples), found.notes.clone());
+    let agreement = renders.first().and_then(|first| agreement(first, &validation, &truths));
+    metrics.extend(agreement.map(|value| (AGREEMENT.to_owned(), value)));
     if let (Some(truth), Some((_, cloud))) = (object.surface(), found.clouds.first()) {
         metrics.extend(surface_metrics(cloud, truth, inputs, &validation)?);
         match mesh_metrics(cloud, truth)? {

@@ -140,8 +140,8 @@ impl PipelineConfig {
         let (count, iterations, max_resolution) = match quality {
             _ if !whole => (1, 0, 2 * UNIT),
             Quality::Draft => (1, 150, UNIT),
-            Quality::Default => (4, 500, 2 * UNIT),
-            Quality::High => (4, 1000, 2 * UNIT),
+            Quality::Default => (4, 400, 2 * UNIT),
+            Quality::High => (4, 800, 2 * UNIT),
         };
         let detect = if whole && quality != Quality::Draft { Detect::Auto } else { Detect::Off };
         let init = if whole { Init::Fit } else { Init::Flow };

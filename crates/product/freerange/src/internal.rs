@@ -9,6 +9,7 @@ pub use crate::{
         checkpoint_bytes, checkpoint_header, checkpoint_sha256, encoder_for_training, find_encoder, load_checkpoint,
     },
     leave_one_out::leave_one_out,
+    pipeline::optimize_alone,
     reconstructor::network_gaussians,
 };
 

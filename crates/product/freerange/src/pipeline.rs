@@ -128,3 +128,18 @@ impl Reconstructor {
         Ok(Reconstruction { samples, network_views, canonical_from_user, notes, seconds })
     }
 }
+
+/// The last step alone, on Gaussians of the frame of the views.
+///
+/// # Errors
+/// As [`Reconstructor::run`].
+pub fn optimize_alone(views: &[View], options: &Options, cloud: &Gaussians, seed: u64) -> Result<Gaussians, Error> {
+    let mut quiet = |_: &Progress<'_>| ControlFlow::Continue(());
+    let watch = &mut Watch::new(&mut quiet);
+    let mut scene = CanonicalScene::new(views, options, watch)?;
+    let symmetry = symmetry::detect(&scene, &options.pipeline, watch)?;
+    let targets = symmetry.targets(&mut scene);
+    let proposals = [scene.user_proposal(cloud)?];
+    let result = optimize::optimize(&scene, &targets, &options.pipeline.optimize, &proposals, seed, watch)?;
+    Ok(to_user(&result, &scene.canonical_from_user))
+}

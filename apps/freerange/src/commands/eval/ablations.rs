@@ -81,14 +81,15 @@ pub fn run(args: &Args, job: &Job) -> Result<(), CliError> {
     let inputs = args.checked_inputs()?;
     let device = job.open(a.pipeline.device)?;
     let method = a.open_method(&device)?;
-    let Method::Model { model, options: default, sha256 } = &method else {
+    let Method::Model { model, options: default, sha256, .. } = &method else {
         return Err(CliError::failure("a model's method expected"));
     };
     // All settings are looked at before the first one is worked on.
     let planned = args.plan(default, inputs)?;
     let (shared, source) = a.open_shared(&device, job)?;
     let open = |folder: &str, options: &Options, count: usize| {
-        let method = Method::Model { model: model.clone(), options: Box::new(options.clone()), sha256: sha256.clone() };
+        let (model, options, sha256) = (model.clone(), Box::new(options.clone()), sha256.clone());
+        let method = Method::Model { model, options, sha256, oracle: false };
         let settings = a.settings(&method, &[count], &shared, &source);
         let path = args.output.join(folder);
         let prefix = format!("{folder}: ");

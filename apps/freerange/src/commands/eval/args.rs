@@ -135,21 +135,21 @@ impl RunArgs {
             (MethodName::Ply, Some(folder)) if !folder.is_dir() => {
                 return Err(CliError::file(folder, "expected a folder of .ply files"));
             }
-            (MethodName::Model | MethodName::Start | MethodName::Fit | MethodName::White, Some(_)) => {
+            (_, Some(_)) if self.method != MethodName::Ply => {
                 return refuse("--ply DIR goes with --method ply only");
             }
             _ => {}
         }
-        let drawn = matches!(self.method, MethodName::Model | MethodName::Start | MethodName::Fit);
+        let samples = matches!(self.method, MethodName::Model | MethodName::Start | MethodName::Oracle);
+        let drawn = samples || self.method == MethodName::Fit;
         if !drawn && (self.samples > 1 || self.inputs.len() > 1) {
             return refuse("--method white and ply: expected one sample and one number of inputs, they change nothing");
         }
         if !drawn && (self.pipeline.seed != 0 || self.up != UpChoice::Auto) {
-            return refuse("--seed and --up go with --method model, start and fit only");
+            return refuse("--seed and --up go with --method model, start, oracle and fit only");
         }
-        let samples = matches!(self.method, MethodName::Model | MethodName::Start);
         if let Some(option) = self.pipeline.given().filter(|_| !samples) {
-            return refuse(&format!("{option} goes with --method model and start only"));
+            return refuse(&format!("{option} goes with --method model, start and oracle only"));
         }
         if let Some(file) = self.pipeline.init_file() {
             let text = format!("--init: expected fit or flow for many objects, found {}", file.display());
@@ -159,7 +159,7 @@ impl RunArgs {
             return refuse("--fit-iterations and --fit-size go with --method fit only");
         }
         Ok(match self.method {
-            MethodName::Model | MethodName::Start => {
+            MethodName::Model | MethodName::Start | MethodName::Oracle => {
                 let model = self.pipeline.open(device)?;
                 let mut options = self.pipeline.options(&model, self.samples)?;
                 options.frame.up = self.up.or_z();
@@ -168,14 +168,18 @@ impl RunArgs {
                     let option = of_network.map(|(key, _)| format!("--set {key}"));
                     if let Some(option) = option.or_else(|| self.pipeline.precision.map(|_| "--precision".into())) {
                         return refuse(&format!(
-                            "{option} goes with --method model only: start leaves the network out"
+                            "{option} goes with --method model and oracle only: start leaves the network out"
                         ));
                     }
                 }
                 options = internal::without_network(options, self.method == MethodName::Start);
                 model.check(&options)?;
                 let sha256 = self.pipeline.checkpoint_sha256()?;
-                Method::Model { model: Arc::new(model), options: Box::new(options), sha256 }
+                let oracle = self.method == MethodName::Oracle;
+                if oracle && options.pipeline.optimize.iterations == 0 {
+                    return refuse("--method oracle: expected one or more --iterations");
+                }
+                Method::Model { model: Arc::new(model), options: Box::new(options), sha256, oracle }
             }
             MethodName::Fit => {
                 let seeds = (0..u64::from(self.samples)).map(|i| self.pipeline.seed.wrapping_add(i)).collect();

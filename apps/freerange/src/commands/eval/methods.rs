@@ -6,8 +6,13 @@ use std::{
     sync::Arc,
 };
 
-use freerange::{FrameConfig, Options, Reconstructor, Up, View, internal::is_without_network, to_canonical, to_user};
+use freerange::{
+    FrameConfig, Options, Reconstructor, Up, View,
+    internal::{is_without_network, optimize_alone},
+    to_canonical, to_user,
+};
 use freerange_eval::{
+    MeshSurface,
     record::{Case, ViewSet},
     runner::{self, Reconstructed},
 };
@@ -15,6 +20,7 @@ use freerange_gaussians::{Gaussians, read_ply};
 use freerange_optim::{FitConfig, Rates, fit};
 use serde_json::{Value, json};
 
+use super::oracle::on_true_surface;
 use crate::error::CliError;
 
 /// What is measured.
@@ -24,6 +30,8 @@ pub enum MethodName {
     Model,
     /// The same pipeline without the network: initial fits, then the optimization.
     Start,
+    /// The model's result with a layer of Gaussians on the true surface, optimized again. Needs objects with meshes.
+    Oracle,
     /// 3DGS-MCMC on the input views alone.
     Fit,
     /// No Gaussians: a white image.
@@ -43,6 +51,8 @@ pub enum Method {
         options: Box<Options>,
         /// SHA-256 of the checkpoint.
         sha256: String,
+        /// Whether the true surface is given away.
+        oracle: bool,
     },
     /// 3DGS-MCMC; one fit per seed.
     Fit {
@@ -73,6 +83,7 @@ pub fn fit_config(iterations: usize, size: u32) -> FitConfig {
 impl runner::Method for Method {
     fn label(&self) -> String {
         match self {
+            Self::Model { oracle: true, .. } => "on the true surface".into(),
             Self::Model { options, .. } => {
                 let what = if is_without_network(options) { "without the network" } else { "model" };
                 match options.pipeline.optimize.iterations {
@@ -86,8 +97,8 @@ impl runner::Method for Method {
         }
     }
 
-    fn make(&self, case: &Case, inputs: &[View]) -> Result<Reconstructed, String> {
-        self.gaussians(case, inputs).map_err(|e| e.to_string())
+    fn make(&self, case: &Case, inputs: &[View], truth: Option<&MeshSurface>) -> Result<Reconstructed, String> {
+        self.gaussians(case, inputs, truth).map_err(|e| e.to_string())
     }
 }
 
@@ -95,10 +106,17 @@ impl Method {
     /// What its numbers depend on.
     pub fn settings(&self) -> Value {
         match self {
-            Self::Model { options, sha256, .. } => json!({
-                "name": if is_without_network(options) { "start" } else { "model" }, "checkpoint_sha256": sha256, "pipeline": options.pipeline,
-                "seeds": options.seeds, "up": format!("{:?}", options.frame.up).to_lowercase(),
-            }),
+            Self::Model { options, sha256, oracle, .. } => {
+                let name = match (oracle, is_without_network(options)) {
+                    (true, _) => "oracle",
+                    (false, true) => "start",
+                    (false, false) => "model",
+                };
+                json!({
+                    "name": name, "checkpoint_sha256": sha256, "pipeline": options.pipeline,
+                    "seeds": options.seeds, "up": format!("{:?}", options.frame.up).to_lowercase(),
+                })
+            }
             Self::Fit { config, seeds, up } => json!({
                 "name": "fit", "fit": config, "seeds": seeds, "up": format!("{up:?}").to_lowercase(),
             }),
@@ -107,13 +125,28 @@ impl Method {
         }
     }
 
-    fn gaussians(&self, case: &Case, inputs: &[View]) -> Result<Reconstructed, CliError> {
+    fn gaussians(&self, case: &Case, inputs: &[View], truth: Option<&MeshSurface>) -> Result<Reconstructed, CliError> {
         let mut notes = Vec::new();
         let clouds = match self {
-            Self::Model { model, options, .. } => {
+            Self::Model { model, options, oracle, .. } => {
                 let result = model.run(inputs, options, &mut |_| ControlFlow::Continue(()))?;
                 notes = result.notes.into_iter().map(|note| note.text).collect();
-                result.samples.into_iter().map(|s| (s.seed, s.gaussians)).collect()
+                let samples = result.samples.into_iter().map(|s| (s.seed, s.gaussians));
+                match (oracle, truth) {
+                    (false, _) => samples.collect(),
+                    (true, Some(truth)) => {
+                        let again = |(seed, cloud): (u64, Gaussians)| {
+                            let cloud = on_true_surface(&cloud, truth, inputs);
+                            Ok((seed, optimize_alone(inputs, options, &cloud, seed)?))
+                        };
+                        samples.map(again).collect::<Result<_, CliError>>()?
+                    }
+                    (true, None) => {
+                        let text =
+                            "--method oracle: expected objects with meshes: generated ones, or --scenes with --meshes";
+                        return Err(CliError::input(text));
+                    }
+                }
             }
             Self::Fit { config, seeds, up } => {
                 let (frame, canonical) = to_canonical(inputs, &FrameConfig { up: *up, ..FrameConfig::default() })?;

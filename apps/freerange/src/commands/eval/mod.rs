@@ -4,6 +4,7 @@ mod ablations;
 mod args;
 mod compare;
 mod methods;
+mod oracle;
 mod paper_pictures;
 mod paper_tables;
 mod sources;

@@ -7,7 +7,7 @@ use crate::coupling::Coupling;
 
 /// Number of the meaning of settings in records: of a pipeline, a sampler, fits and optimization. Raise it whenever the same
 /// recorded settings come to mean another computation, or a default changes: results of different numbers are never mixed.
-pub const SETTINGS_SCHEMA: u32 = 5;
+pub const SETTINGS_SCHEMA: u32 = 6;
 
 /// Settings of a [`FlowSampler`](super::FlowSampler); the defaults are the paper's. Records hold every field.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
@@ -46,7 +46,7 @@ impl Default for FlowConfig {
             gradient_size: 512,
             background: Background::Random,
             coupling: Coupling::Independent,
-            compute: Compute::F32,
+            compute: Compute::Auto,
         }
     }
 }
@@ -70,7 +70,7 @@ pub struct RefinerConfig {
 
 impl Default for RefinerConfig {
     fn default() -> Self {
-        Self { passes: 12, retokenize_every: 4, lod_depth: None, gradient_size: 128, compute: Compute::F32 }
+        Self { passes: 12, retokenize_every: 4, lod_depth: None, gradient_size: 128, compute: Compute::Auto }
     }
 }
 
@@ -162,14 +162,14 @@ mod tests {
     /// where records of this one are read ([`Settings`](crate::settings::Settings)).
     #[test]
     fn defaults_are_those_of_their_schema() {
-        assert_eq!(SETTINGS_SCHEMA, 5);
+        assert_eq!(SETTINGS_SCHEMA, 6);
         let flow = serde_json::json!({
             "steps": 50, "lod_depth": null, "cfg_scale": 2.0, "lambda_pg": 50.0, "gradient_at": "noisy",
-            "gradient_size": 512, "background": "random", "coupling": "independent", "compute": "f32"
+            "gradient_size": 512, "background": "random", "coupling": "independent", "compute": "auto"
         });
         assert_eq!(serde_json::to_value(FlowConfig::default()).unwrap(), flow);
         let refiner = serde_json::json!({
-            "passes": 12, "retokenize_every": 4, "lod_depth": null, "gradient_size": 128, "compute": "f32"
+            "passes": 12, "retokenize_every": 4, "lod_depth": null, "gradient_size": 128, "compute": "auto"
         });
         assert_eq!(serde_json::to_value(RefinerConfig::default()).unwrap(), refiner);
     }

@@ -13,6 +13,8 @@ mod cpu;
 #[cfg(feature = "gpu")]
 mod cube;
 
+pub(crate) use cpu::has_bf16 as cpu_has_bf16;
+
 use burn::backend::{Backend, tensor::FloatTensor};
 
 use crate::Compute;

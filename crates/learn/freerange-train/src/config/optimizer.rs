@@ -27,7 +27,7 @@ pub struct OptimizerConfig {
     pub clip: f32,
     /// Decay of the moving average of the weights (reached gradually over the first steps).
     pub ema: f32,
-    /// Precision of the blocks: `f32`, `bf16`, or `auto` for the faster on this device, chosen once for a run. Weights and sums stay in 32 bits.
+    /// Precision of the blocks: `f32`, `bf16`, or `auto` for bf16 where the device has it, chosen once for a run. Weights and sums stay in 32 bits.
     pub compute: Compute,
     /// All-reduce dtype of gradients: `f32`, or `bf16` for half of the bytes.
     pub all_reduce_dtype: AllReduceDtype,

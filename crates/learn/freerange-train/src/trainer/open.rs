@@ -199,8 +199,8 @@ impl Prepared {
     }
 }
 
-/// What a run computes in. What is automatic is chosen once, by rank 0, and recorded in the run's state: which arithmetic is
-/// faster may look different from each rank and at each start, and a run that goes on in another one gives other bits.
+/// What a run computes in. What is automatic is chosen once, by rank 0, and recorded in the run's state: other ranks, and the
+/// machine on which the run goes on, may have other processors, and another precision gives other bits.
 fn compute_of_run(ranks: &dyn Ranks, compute: Compute, folder: &Path, device: &Device) -> Result<Compute, TrainError> {
     if compute != Compute::Auto {
         return Ok(compute);

@@ -794,7 +794,7 @@ fn what_is_automatic_is_chosen_once_for_a_run() {
     };
     let chosen = begin(Compute::Auto);
     assert_eq!(recorded()["compute"], chosen);
-    // Timed on another machine, or a busy one.
+    // Begun on another machine.
     let other = if chosen == "f32" { "bf16" } else { "f32" };
     let mut progress = recorded();
     progress["compute"] = other.into();
