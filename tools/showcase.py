@@ -1,17 +1,15 @@
-"""Objects in rows: input photos, further photos, and renders of the result beneath them (docs/images/showcase.png).
+"""Objects in rows: input photos, the baseline fit, the result, the ground truth (docs/images/comparison.jpg, print.jpg).
 
-usage: showcase.py [--compare | --print] OUT SCENE=RESULT [SCENE=RESULT ...]
+usage: showcase.py --compare | --print OUT SCENE=RESULT [SCENE=RESULT ...]
 SCENE is a scene folder with transforms_full.json and transforms_val.json; RESULT holds what `freerange reconstruct
-SCENE/transforms_full.json -o RESULT/out` and `freerange render RESULT/out/gaussians.ply --cameras SCENE/transforms_val.json
--o RESULT/renders` wrote. Needs Pillow. Writes OUT.png.
+SCENE/transforms_full.json -o RESULT/out --eval-scene SCENE/transforms_val.json` and `freerange render RESULT/out/gaussians.ply
+--cameras SCENE/transforms_val.json -o RESULT/renders` wrote. RESULT/fit holds what `freerange render RESULT/fit.ply --cameras
+SCENE/transforms_val.json -o RESULT/fit` wrote of the baseline: `cargo run --release -p freerange-cli --example baseline --
+SCENE/transforms_full.json RESULT/fit.ply`. Needs Pillow. Writes OUT.jpg.
 
---compare: labeled columns instead: inputs, the baseline fit, the result, the ground truth (docs/images/comparison.jpg);
-writes OUT.jpg. RESULT/out was made with --eval-scene
-SCENE/transforms_val.json; RESULT/fit holds what `freerange render RESULT/fit.ply --cameras SCENE/transforms_val.json -o RESULT/fit`
-wrote of the baseline: `cargo run --release -p freerange-cli --example baseline -- SCENE/transforms_full.json RESULT/fit.ply`.
-
---print: as --compare, and in two lines per object: the whole view, and its middle enlarged (docs/images/print.jpg). A column
-"before" shows RESULT/before, the renders of an earlier result, where there is one.
+--compare: one line per object.
+--print: two lines per object, the whole view and its middle enlarged. A column "before" shows RESULT/before, the renders of an
+earlier result, where there is one.
 """
 import json
 import pathlib
@@ -19,7 +17,7 @@ import sys
 
 from PIL import Image, ImageDraw, ImageFont
 
-INPUT, LARGE, GAP, FURTHER = 112, 168, 4, (0, 4, 8)
+INPUT, GAP = 112, 4
 
 
 def over_white(path, size):
@@ -35,22 +33,6 @@ def photos(scene, name):
     frames = json.loads((scene / name).read_text())["frames"]
     files = [scene / f["file_path"] for f in frames]
     return [f if f.suffix else f.with_suffix(".png") for f in files]
-
-
-def row(scene, result):
-    height = 2 * LARGE + GAP
-    width = 2 * INPUT + 2 * GAP + len(FURTHER) * (LARGE + GAP)
-    picture = Image.new("RGB", (width, height), (255, 255, 255))
-    top = (height - 2 * INPUT - GAP) // 2
-    for i, file in enumerate(photos(scene, "transforms_full.json")[:4]):
-        picture.paste(over_white(file, INPUT), ((i % 2) * (INPUT + GAP), top + (i // 2) * (INPUT + GAP)))
-    renders = sorted((result / "renders").glob("*.png"))
-    truth = photos(scene, "transforms_val.json")
-    for column, view in enumerate(FURTHER):
-        left = 2 * INPUT + 2 * GAP + GAP + column * (LARGE + GAP)
-        picture.paste(over_white(truth[view], LARGE), (left, 0))
-        picture.paste(over_white(renders[view], LARGE), (left, LARGE + GAP))
-    return picture
 
 
 def median_view(result):
@@ -111,20 +93,9 @@ def prints(out, pairs):
 
 
 def main():
-    arguments = sys.argv[1:]
-    labeled = {"--compare": compare, "--print": prints}.get(arguments[0])
-    out, *rest = arguments[1:] if labeled else arguments
-    pairs = [tuple(map(pathlib.Path, a.split("="))) for a in rest]
-    if labeled:
-        labeled(out, pairs)
-        return
-    rows = [row(*pair) for pair in pairs]
-    sheet = Image.new("RGB", (rows[0].width, sum(r.height for r in rows) + 4 * GAP * (len(rows) - 1)), (255, 255, 255))
-    top = 0
-    for picture in rows:
-        sheet.paste(picture, (0, top))
-        top += picture.height + 4 * GAP
-    sheet.save(out + ".png", optimize=True)
+    how, out, *rest = sys.argv[1:]
+    draw = {"--compare": compare, "--print": prints}[how]
+    draw(out, [tuple(map(pathlib.Path, a.split("="))) for a in rest])
 
 
 main()

@@ -71,7 +71,13 @@ fn rows_are_trained_and_evaluated_beside_those_that_are_kept() {
     assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
     let place = root.join("place").canonicalize().unwrap();
     let commands: Vec<&str> = calls.lines().filter(|line| line.contains(' ')).collect();
-    let begins = ["data generate", "train ", "model info", "eval --pictures none --generated 100", "eval paper-tables"];
+    let begins = [
+        "data generate",
+        "train ",
+        "model info",
+        "eval --pictures none --precision f32 --generated 100",
+        "eval paper-tables",
+    ];
     let again = &begins[1..];
     for (command, begin) in commands.iter().zip(begins.iter().chain(again)) {
         assert!(command.starts_with(begin), "{command}, not {begin}");
