@@ -81,7 +81,8 @@ fn parsed<T: serde::de::DeserializeOwned>(name: &str, value: &Value) -> Result<T
 const LAMBDA_PG: f32 = 10.0;
 
 /// Settings of schema 1, in which one table held sampling from noise, network refinement and what follows it. The latter
-/// belongs to the pipeline's presets now. Fields that were left out had the defaults of then, which are still these.
+/// belongs to the pipeline's presets now. Fields that were left out had the defaults of then, which are still these, but for
+/// the precision ([`AUTOMATIC`]).
 fn converted(value: &Value) -> Result<(FlowConfig, Option<RefinerConfig>), FlowError> {
     let get = |name: &str| value.get(name).filter(|v| !v.is_null());
     let fixed_point = get("solver").is_some_and(|s| s == "hold");

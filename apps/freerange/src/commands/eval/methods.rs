@@ -128,23 +128,22 @@ impl Method {
     fn gaussians(&self, case: &Case, inputs: &[View], truth: Option<&MeshSurface>) -> Result<Reconstructed, CliError> {
         let mut notes = Vec::new();
         let clouds = match self {
+            Self::Model { oracle: true, .. } if truth.is_none() => {
+                let text = "--method oracle: expected objects with meshes: generated ones, or --scenes with --meshes";
+                return Err(CliError::input(text));
+            }
             Self::Model { model, options, oracle, .. } => {
                 let result = model.run(inputs, options, &mut |_| ControlFlow::Continue(()))?;
                 notes = result.notes.into_iter().map(|note| note.text).collect();
                 let samples = result.samples.into_iter().map(|s| (s.seed, s.gaussians));
-                match (oracle, truth) {
-                    (false, _) => samples.collect(),
-                    (true, Some(truth)) => {
+                match truth.filter(|_| *oracle) {
+                    None => samples.collect(),
+                    Some(truth) => {
                         let again = |(seed, cloud): (u64, Gaussians)| {
                             let cloud = on_true_surface(&cloud, truth, inputs);
                             Ok((seed, optimize_alone(inputs, options, &cloud, seed)?))
                         };
                         samples.map(again).collect::<Result<_, CliError>>()?
-                    }
-                    (true, None) => {
-                        let text =
-                            "--method oracle: expected objects with meshes: generated ones, or --scenes with --meshes";
-                        return Err(CliError::input(text));
                     }
                 }
             }
