@@ -255,7 +255,7 @@ def main():
         by_photos.append(reconstructed(binary, place, names, count, f"by-photos-{count}", []))
     for count in numbers("GAUSSIANS", "2048 8192 16384 32768 65536"):
         print(f"{count} Gaussians ...", flush=True)
-        # The network makes 2,048; the optimization 8,192 for each 256 pixels.
+        # The network makes 2,048; the optimization 8,192 for each 256 pixels, before the layer. The table has the true number.
         side = count // 32
         options = ["--iterations", "0"] if count < 8192 else ["--set", f"optimize.max_resolution={side}", "--max-resolution", str(max(1024, 2 * side))]
         by_gaussians.append(reconstructed(binary, place, names, 4, f"by-gaussians-{count}", ["--symmetry", "off", *options]))

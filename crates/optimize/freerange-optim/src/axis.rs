@@ -127,7 +127,7 @@ pub fn find_axis(
     let before = pictures.difference::<Axis>(own, None, f64::INFINITY)?;
     (_, axis) = put(own, axis, [0.04, 0.004])?;
     let photos: Vec<PosedImage<'_>> = views.iter().map(PosedImage::from).collect();
-    let both = |axis: &Axis| Evidence { views: photos.clone(), silhouettes: turned(&photos, axis) };
+    let both = |axis: &Axis| Evidence { silhouettes: turned(&photos, axis), ..photos.clone().into() };
     let Some(mut cloud) = search.fitted(None, both(&axis), config)? else { return Ok(None) };
     for _ in 0..ROUNDS {
         (_, axis) = put(&cloud, axis, [0.01, 0.002])?;

@@ -113,7 +113,10 @@ pub struct OptimizationConfig {
     pub rates: Rates,
     /// Longest side, in pixels, at which views are compared; larger ones are shrunk.
     pub render_size: u32,
-    /// Part of the steps, the first ones, that compare views at [`coarse_size`](Self::coarse_size): what they see is coarse as yet. 0..1
+    /// Part of the steps, the last ones, that have one layer of flat Gaussians where photos see the object's surface, and up to twice as
+    /// many in all. 0: no layer. 0..1
+    pub layer: f64,
+    /// Part of the other steps, the first ones, that compare views at [`coarse_size`](Self::coarse_size): what they see is coarse as yet. 0..1
     pub coarse: f64,
     /// Longest side in pixels at which these steps compare views. Smaller views are compared as they are.
     pub coarse_size: u32,
@@ -132,6 +135,7 @@ impl Default for OptimizationConfig {
             gaussians: 8192,
             rates: Rates { mean: 1.5e-3, scale: 5e-3, rotation: 1e-3, opacity: 0.05, color: 2.5e-3 },
             render_size: 256,
+            layer: 0.0,
             coarse: 0.0,
             coarse_size: 256,
             window: 1.0,
@@ -249,13 +253,21 @@ const MOST_STEPS: f64 = 5.0;
 /// Up to so many pixels, the longest side, pictures grow with the number of photos.
 const MOST_GROWN: u32 = 512;
 
-/// What [`OptimizationConfig::coarse`] and [`OptimizationConfig::window`] are where detail is asked for: less time, and the same in
-/// the end.
+/// What [`OptimizationConfig::coarse`] and [`OptimizationConfig::window`] are where detail is asked for.
 const COARSE: f64 = 0.6;
 const WINDOW: f64 = 0.6;
 
 /// So many times as much anchors weigh beside windows, in which the object's pixels count for more than in whole views.
 const BESIDE_WINDOWS: f64 = 1.5;
+
+/// What [`OptimizationConfig::layer`] is there.
+const LAYER: f64 = 0.25;
+/// Times as many Gaussians as without it, at most.
+const MORE: usize = 2;
+/// So many times as much anchors weigh beside the layer: they show what the steps before it made, from all around.
+const BESIDE_LAYER: f64 = 4.0;
+/// Learning rates of the centers beside the layer, at first and at the end: the surface is to stay.
+const LAYER_MEAN_RATES: [f64; 2] = [1e-4, 1e-5];
 
 impl OptimizationConfig {
     /// These settings, which are for up to four photos, for so many: more steps, five times as many for sixteen, more of their pixels, up
@@ -274,7 +286,8 @@ impl OptimizationConfig {
     }
 
     /// These settings for finer detail: so many times the size of pictures and the Gaussians, and so much less weight of the anchors, whose own pictures
-    /// are small; at first at half that size. From 3 on half as many times the steps as well: 2 needs no more of them. 1 changes nothing.
+    /// are small; at first at half that size, and in the end with a layer on the surface. From 3 on half as many times the steps as well: 2
+    /// needs no more of them. 1 changes nothing.
     /// Photos, whose longest side has `longest` pixels, have no finer detail than their pixels: it is as much as they can show at most.
     #[must_use]
     pub fn detailed(self, detail: usize, longest: u32) -> Self {
@@ -287,6 +300,7 @@ impl OptimizationConfig {
             steps: self.steps.saturating_mul(detail) / 2,
             gaussians: self.gaussians.saturating_mul(detail),
             render_size: grown(self.render_size),
+            layer: LAYER,
             coarse: COARSE,
             window: WINDOW,
             coarse_size: (grown(self.coarse_size) / 2).max(1),
@@ -295,15 +309,25 @@ impl OptimizationConfig {
         }
     }
 
-    /// The fit that goes on from a cloud of `start` Gaussians.
-    pub(crate) fn fit(&self, start: usize) -> FitConfig {
+    /// Most Gaussians at the end.
+    pub(crate) fn most(&self) -> usize {
+        if self.layer > 0.0 { self.gaussians.saturating_mul(MORE) } else { self.gaussians }
+    }
+
+    /// Anchors of the steps with the layer.
+    pub(crate) fn anchors_of_layer(&self) -> AnchorConfig {
+        AnchorConfig { weight: BESIDE_LAYER * self.anchors.weight, ..self.anchors }
+    }
+
+    /// The fit of so many steps that goes on from a cloud of `start` Gaussians.
+    pub(crate) fn fit(&self, start: usize, steps: usize) -> FitConfig {
         let most = self.gaussians.max(start);
         // A round comes at every multiple of the interval but step 0.
-        let last = GROWTH_STOP * self.steps as f64;
+        let last = GROWTH_STOP * steps as f64;
         let interval = ((last / (GROWTH_ROUNDS + 1) as f64) as usize).max(1);
         let rounds = ((last / interval as f64).ceil() as i32 - 1).max(1);
         FitConfig {
-            iterations: self.steps,
+            iterations: steps,
             cap_max: most,
             initial: start,
             refine_every: interval,
@@ -311,8 +335,25 @@ impl OptimizationConfig {
             growth_stop: GROWTH_STOP,
             // One Gaussian more, since rounds round down.
             growth: (most as f64 / start as f64).powf(1.0 / f64::from(rounds)) + 1.0 / start as f64,
-            rates: self.rates.hastened(self.steps),
+            rates: self.rates.hastened(steps),
             final_mean_rate: FINAL_MEAN_RATE,
+            render_size: Some(self.render_size),
+            seed: self.seed,
+            ..FitConfig::default()
+        }
+    }
+
+    /// The fit of so many steps of a cloud with a layer: neither relocation nor noise.
+    pub(crate) fn fit_of_layer(&self, start: usize, steps: usize) -> FitConfig {
+        let [mean, final_mean_rate] = LAYER_MEAN_RATES;
+        FitConfig {
+            iterations: steps,
+            cap_max: start,
+            initial: start,
+            growth_stop: 0.0,
+            noise_lr: 0.0,
+            rates: Rates { mean, ..self.rates },
+            final_mean_rate,
             render_size: Some(self.render_size),
             seed: self.seed,
             ..FitConfig::default()
@@ -344,7 +385,7 @@ mod tests {
 
     #[test]
     fn few_steps_have_faster_rates() {
-        let of = |steps: usize| OptimizationConfig { steps, ..OptimizationConfig::default() }.fit(1000).rates;
+        let of = |steps: usize| OptimizationConfig::default().fit(1000, steps).rates;
         let usual = Rates { mean: 1.5e-3, scale: 5e-3, rotation: 1e-3, opacity: 0.05, color: 2.5e-3 };
         assert_eq!((of(2000), of(100_000)), (usual, usual), "those of 3DGS, but for centers");
         for (steps, times) in [(1, 3.0), (400, 3.0), (894, 3f64.sqrt()), (1999, 1.0)] {
@@ -367,10 +408,12 @@ mod tests {
             (two.steps, two.gaussians, two.render_size, two.anchors.weight),
             (400, 16_384, 512, 1.5 * 0.1 / 2.0)
         );
-        assert_eq!((two.coarse, two.coarse_size, two.window), (0.6, 256, 0.6));
+        assert_eq!((two.layer, two.coarse, two.coarse_size, two.window), (0.25, 0.6, 256, 0.6));
+        assert_eq!((config.most(), two.most()), (8192, 32_768));
+        assert!((two.anchors_of_layer().weight - 0.3).abs() < 1e-12);
         let four = config.clone().detailed(4, 4000);
         assert_eq!((four.steps, four.gaussians, four.render_size, four.coarse_size), (800, 32_768, 1024, 512));
-        assert_eq!(four.anchors.weight, 1.5 * 0.1 / 4.0);
+        assert_eq!((four.most(), four.anchors.weight), (65_536, 1.5 * 0.1 / 4.0));
         // No more than photos show.
         assert_eq!(config.clone().detailed(4, 512), two);
         assert_eq!(config.clone().detailed(4, 257), two);
@@ -414,7 +457,7 @@ mod tests {
     fn an_optimization_grows_to_its_number() {
         for (steps, start) in [(400, 1024), (1, 1024), (20, 1), (1000, 5000), (7, 3)] {
             let config = OptimizationConfig { steps, ..Default::default() };
-            let fit = config.fit(start);
+            let fit = config.fit(start, steps);
             fit.check().unwrap();
             let due = |step: &usize| {
                 *step >= fit.growth_start

@@ -28,6 +28,7 @@ mod optimize;
 mod quality;
 mod reproject;
 mod search;
+mod surface;
 #[cfg(test)]
 mod tests;
 mod views;

@@ -6,12 +6,13 @@ use crate::{
     fit::{checked, descend, looked_at, next_views},
     mcmc::split,
     objective::Objective,
+    surface::layered,
     views::Targets,
 };
 use freerange_gaussians::Gaussians;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-use std::ops::ControlFlow;
+use std::{cell::Cell, ops::ControlFlow};
 
 /// Longest side, in pixels, of silhouettes. They come from guesses, which nobody vouches for to the pixel.
 const SILHOUETTES: u32 = 128;
@@ -25,6 +26,9 @@ const SILHOUETTES: u32 = 128;
 /// have the photos' colors: print then lies on that surface from everywhere. As guesses differ, the optimization begins with as many
 /// of them in one place as there are to be Gaussians, each fainter, so that together they show about what one alone does.
 /// Silhouettes, where there are any, come beside the views at every other step.
+///
+/// For the last steps, where the [configuration](OptimizationConfig::layer) asks for it, one layer of flat Gaussians takes the place
+/// of those that photos see, in the photos' colors. These steps improve it beside pictures of what the others made.
 /// `progress` hears of every step, and ends with what there is by `ControlFlow::Break`. The same input gives the same bytes.
 ///
 /// # Errors
@@ -35,49 +39,96 @@ pub fn optimize<'a>(
     others: &[Gaussians],
     seen: impl Into<Evidence<'a>>,
     config: &OptimizationConfig,
-    progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
+    mut progress: impl FnMut(&FitProgress<'_>) -> ControlFlow<()>,
 ) -> Result<Gaussians, FitError> {
     let seen = seen.into();
-    let targets = Targets::new(seen.views.clone(), Some(config.render_size))?;
-    let first = (config.coarse * config.steps as f64) as usize;
-    let coarse = (first > 0).then(|| Targets::new(seen.views.clone(), Some(config.coarse_size))).transpose()?;
-    let further = seen.silhouettes.len();
-    let size = Some(config.render_size.min(SILHOUETTES));
-    let silhouettes = (further > 0).then(|| Targets::new(seen, size)).transpose()?;
+    let views = Evidence { silhouettes: Vec::new(), ..seen.clone() };
+    let targets = Targets::new(views.clone(), Some(config.render_size))?;
+    let with_layer = (config.layer * config.steps as f64) as usize;
+    let before = config.steps - with_layer;
+    let first = (config.coarse * before as f64) as usize;
+    let coarse = (first > 0).then(|| Targets::new(views, Some(config.coarse_size))).transpose()?;
+    let silhouettes = Silhouettes::new(seen, config)?;
     let clouds = std::iter::once(cloud).chain(others).map(|cloud| checked(cloud, usize::MAX));
     let clouds = clouds.collect::<Result<Vec<_>, _>>()?;
-    let anchors = Anchors::new(&clouds, coarse.as_ref().unwrap_or(&targets), &config.anchors)?;
+    let small = coarse.as_ref().unwrap_or(&targets);
+    let anchors = Anchors::new(&clouds, small, &config.anchors)?;
     let start = together(&clouds, config.gaussians);
-    let fit = config.fit(start.len());
+    let fit = config.fit(start.len(), before);
     fit.check()?;
     let mut rng = ChaCha8Rng::seed_from_u64(config.seed);
-    // A stream of its own: the photos come in the same order with and without anchors.
-    let mut anchor_rng = ChaCha8Rng::seed_from_u64(config.seed);
-    anchor_rng.set_stream(1);
-    let mut queue = Vec::new();
-    // Photos have more to tell here than shape: silhouettes come beside them, at every other step.
-    let (mut silhouette_queue, mut step) = (Vec::new(), 0);
-    let more = |cloud: &Gaussians, background| {
-        step += 1;
-        let by_silhouette = silhouettes
-            .as_ref()
-            .filter(|targets| step % 2 == 0 && looked_at(targets.weights[targets.views], &mut anchor_rng));
-        let by_silhouette =
-            by_silhouette.map(|targets| (targets, next_views(&mut silhouette_queue, further, 1, &mut anchor_rng)));
+    let stopped = Cell::new(false);
+    let mut tell = |done: usize, told: &FitProgress<'_>| {
+        let flow = progress(&FitProgress { step: done + told.step, steps: config.steps, ..*told });
+        stopped.set(flow.is_break());
+        flow
+    };
+    let mut further = Further::new(&anchors, silhouettes.as_ref(), config.seed);
+    let of_step = |step| if step < first { (small, 1.0) } else { (&targets, config.window) };
+    let more = |cloud: &Gaussians, background| further.objectives(cloud, background);
+    let result = descend(start, of_step, &fit, &mut rng, more, |told| tell(0, told))?;
+    if with_layer == 0 || stopped.get() {
+        return Ok(result);
+    }
+    let anchors = Anchors::new(std::slice::from_ref(&result), small, &config.anchors_of_layer())?;
+    let layered = layered(&result, &targets, config.most())?;
+    let fit = config.fit_of_layer(layered.len(), with_layer);
+    let mut further = Further::new(&anchors, silhouettes.as_ref(), config.seed);
+    let more = |cloud: &Gaussians, background| further.objectives(cloud, background);
+    descend(layered, |_| (&targets, config.window), &fit, &mut rng, more, |told| tell(before, told))
+}
+
+/// Silhouettes as an optimization compares them, where there are any.
+struct Silhouettes {
+    targets: Targets,
+    count: usize,
+}
+
+impl Silhouettes {
+    fn new(seen: Evidence<'_>, config: &OptimizationConfig) -> Result<Option<Self>, FitError> {
+        let count = seen.silhouettes.len();
+        let size = Some(config.render_size.min(SILHOUETTES));
+        (count > 0).then(|| Ok(Self { targets: Targets::new(seen, size)?, count })).transpose()
+    }
+}
+
+/// What a step looks at beside a view: a silhouette or an anchor render, in turn.
+struct Further<'a> {
+    anchors: &'a Anchors,
+    silhouettes: Option<&'a Silhouettes>,
+    /// A stream of its own: the photos come in the same order with and without anchors.
+    rng: ChaCha8Rng,
+    queue: Vec<usize>,
+    silhouette_queue: Vec<usize>,
+    step: usize,
+}
+
+impl<'a> Further<'a> {
+    fn new(anchors: &'a Anchors, silhouettes: Option<&'a Silhouettes>, seed: u64) -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        rng.set_stream(1);
+        Self { anchors, silhouettes, rng, queue: Vec::new(), silhouette_queue: Vec::new(), step: 0 }
+    }
+
+    /// The objectives of the next step.
+    fn objectives(&mut self, cloud: &Gaussians, background: [f32; 3]) -> Result<Vec<Objective>, FitError> {
+        self.step += 1;
+        // Photos have more to tell here than shape: silhouettes come beside them, at every other step.
+        let by_silhouette = self.silhouettes.filter(|Silhouettes { targets, .. }| {
+            self.step.is_multiple_of(2) && looked_at(targets.weights[targets.views], &mut self.rng)
+        });
+        let by_silhouette = by_silhouette.map(|Silhouettes { targets, count }| {
+            (targets, next_views(&mut self.silhouette_queue, *count, 1, &mut self.rng))
+        });
         // The other ones than those of silhouettes.
-        let held = if Anchors::due(step) { anchors.views() } else { 0 };
-        let held = next_views(&mut queue, held, 1, &mut anchor_rng);
+        let held = if Anchors::due(self.step) { self.anchors.views() } else { 0 };
+        let held = next_views(&mut self.queue, held, 1, &mut self.rng);
         let (by_silhouette, held) = rayon::join(
             || by_silhouette.map(|(targets, chosen)| Objective::silhouettes(cloud, targets, &chosen)).transpose(),
-            || held.first().map(|&view| anchors.objective(cloud, view, background)).transpose(),
+            || held.first().map(|&view| self.anchors.objective(cloud, view, background)).transpose(),
         );
         Ok(by_silhouette?.into_iter().chain(held?).collect())
-    };
-    let of_step = |step| match &coarse {
-        Some(coarse) if step < first => (coarse, 1.0),
-        _ => (&targets, config.window),
-    };
-    descend(start, of_step, &fit, &mut rng, more, progress)
+    }
 }
 
 /// As many of `clouds` as `most` Gaussians allow, but the first in any case, in one place. Each Gaussian becomes what relocation

@@ -392,6 +392,37 @@ fn refining_may_begin_with_small_pictures() {
     assert!(both.rows() != small.rows() && both.rows() != whole.rows());
 }
 
+/// The last steps go on from a layer, unless the end comes before.
+#[test]
+fn refining_may_end_with_a_layer() {
+    let scene = ball(60, 21);
+    let (start, views) = (disturbed(&scene, 22), ring(4, 64, &scene));
+    let config = OptimizationConfig {
+        steps: 40,
+        gaussians: 300,
+        layer: 0.25,
+        render_size: 64,
+        anchors: small_anchors(),
+        ..Default::default()
+    };
+    let run = |layer, end| {
+        let mut told = Vec::new();
+        let config = OptimizationConfig { layer, ..config.clone() };
+        let found = optimize(&start, &[], &views, &config, |p| {
+            told.push((p.step, p.steps, p.gaussians));
+            if p.step == end { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        });
+        assert!(told.iter().enumerate().all(|(i, (step, steps, _))| (*step, *steps) == (i + 1, 40)));
+        (found.unwrap(), told)
+    };
+    let (with, told) = run(0.25, 0);
+    assert!(told.len() == 40 && told[29].2 <= 300 && with.len() <= 600);
+    assert_eq!(told[30].2, with.len());
+    assert_eq!(run(0.25, 30).0.len(), told[29].2, "an end before the layer");
+    let without = run(0.0, 0).0;
+    assert!(without.len() == 300 && with != without);
+}
+
 /// Refined together, equal clouds look as one does, and there are no more Gaussians than were asked for.
 #[test]
 fn clouds_are_optimized_together() {

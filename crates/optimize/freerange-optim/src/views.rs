@@ -15,6 +15,8 @@ use rayon::prelude::*;
 pub struct Evidence<'a> {
     /// Posed views.
     pub views: Vec<PosedImage<'a>>,
+    /// How many of them, the first ones, are photos: the others show what only symmetry says.
+    pub photos: usize,
     /// Silhouettes from further places: of these images the alpha alone counts.
     pub silhouettes: Vec<PosedImage<'a>>,
 }
@@ -57,7 +59,7 @@ impl<'a> From<&'a View> for PosedImage<'a> {
 
 impl<'a> From<Vec<PosedImage<'a>>> for Evidence<'a> {
     fn from(views: Vec<PosedImage<'a>>) -> Self {
-        Self { views, silhouettes: Vec::new() }
+        Self { photos: views.len(), views, silhouettes: Vec::new() }
     }
 }
 
@@ -89,6 +91,8 @@ pub(crate) struct Targets {
     pub images: Vec<Arc<RgbaImage>>,
     /// How many of them are more than silhouettes.
     pub views: usize,
+    /// How many of these are photos.
+    pub photos: usize,
     /// How often each is looked at ([`PosedImage::weight`]).
     pub weights: Vec<f64>,
     /// How to render each.
@@ -143,7 +147,7 @@ impl Targets {
                 seen.views[0].weight.to_string(),
             );
         }
-        let views = seen.views.len();
+        let (views, photos) = (seen.views.len(), seen.photos.min(seen.views.len()));
         let all: Vec<PosedImage<'_>> = seen.views.into_iter().chain(seen.silhouettes).collect();
         all.iter().try_for_each(check)?;
         // Each picture once, however many share it.
@@ -177,6 +181,7 @@ impl Targets {
             cameras: cameras.collect(),
             images: of.iter().map(|&of| pictures[of].clone()).collect(),
             views,
+            photos,
             weights: all.iter().map(|one| one.weight).collect(),
             rasters: of.iter().map(|&of| rasters[of]).collect(),
         })
@@ -189,6 +194,7 @@ impl Targets {
             cameras: kept.iter().map(|&i| self.cameras[i]).collect(),
             images: kept.iter().map(|&i| self.images[i].clone()).collect(),
             views: kept.len(),
+            photos: kept.iter().filter(|i| **i < self.photos).count(),
             weights: kept.iter().map(|&i| self.weights[i]).collect(),
             rasters: kept.iter().map(|&i| self.rasters[i]).collect(),
         }
@@ -206,6 +212,7 @@ impl Targets {
             cameras: Vec::new(),
             images: Vec::new(),
             views: chosen.len(),
+            photos: chosen.len(),
             weights: vec![1.0; chosen.len()],
             rasters: Vec::new(),
         };

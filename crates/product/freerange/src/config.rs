@@ -115,14 +115,17 @@ const UNIT_GAUSSIANS: usize = 8192;
 const MOST_RESOLUTION: u32 = 16 * UNIT;
 
 impl OptimizeConfig {
-    /// Times 256 pixels, and times 8,192 Gaussians.
+    /// Times 256 pixels.
     pub(crate) fn detail(&self) -> usize {
         (self.max_resolution / UNIT) as usize
     }
 
-    /// Gaussians that it ends with, where photos have the pixels.
+    /// Gaussians that it ends with at most: above 256 pixels a half and more lie in one layer where photos look.
     pub fn max_gaussians(&self) -> usize {
-        self.detail() * UNIT_GAUSSIANS
+        match self.detail() {
+            0 | 1 => UNIT_GAUSSIANS,
+            detail => 2 * detail * UNIT_GAUSSIANS,
+        }
     }
 }
 

@@ -266,7 +266,7 @@ fn choices_are_presets_and_fields() {
     let of = |choices: Choices| model.options_of(&choices).map(|o| o.pipeline).map_err(|e| e.to_string());
     let default = of(Choices::default()).unwrap();
     assert_eq!((default.propose.count, default.optimize.iterations, default.network_views), (4, 400, 6));
-    assert_eq!((default.propose.fit.gaussians, default.optimize.max_gaussians()), (2048, 16_384));
+    assert_eq!((default.propose.fit.gaussians, default.optimize.max_gaussians()), (2048, 32_768));
     let draft = of(Choices { quality: Quality::Draft, ..Choices::default() }).unwrap();
     assert!(draft.propose.count == 1 && draft.symmetry.detect == Detect::Off && draft.optimize.iterations < 400);
     let plain = of(Choices { iterations: Some(0), ..Choices::default() }).unwrap();

@@ -177,7 +177,7 @@ impl Targets<'_> {
     pub fn of_fits(&self) -> Evidence<'_> {
         let mut views: Vec<PosedImage<'_>> = self.network.iter().map(PosedImage::from).collect();
         views[self.network_photos..].iter_mut().for_each(|view| view.weight = self.mirrored_weight);
-        Evidence { silhouettes: self.silhouettes(&views[..self.network_photos]), views }
+        Evidence { silhouettes: self.silhouettes(&views[..self.network_photos]), photos: self.network_photos, views }
     }
 
     /// How many photos there are, without what a symmetry adds.
@@ -188,10 +188,10 @@ impl Targets<'_> {
     /// What the optimization agrees with.
     pub fn of_optimization(&self) -> Evidence<'_> {
         let mut views: Vec<PosedImage<'_>> = self.photos.iter().map(Photo::posed).collect();
-        let silhouettes = self.silhouettes(&views);
+        let (silhouettes, photos) = (self.silhouettes(&views), views.len());
         let weight = self.mirrored_weight;
         views.extend(self.mirrored.iter().map(|view| PosedImage { weight, ..view.into() }));
-        Evidence { views, silhouettes }
+        Evidence { views, photos, silhouettes }
     }
 
     /// Silhouettes of `photos` rotated about the axis, if there is one.
