@@ -106,15 +106,15 @@ impl Default for FitConfig {
 pub struct OptimizationConfig {
     /// Optimization steps; each one looks at one view, and every other one at an anchor render.
     pub steps: usize,
-    /// Number of Gaussians at the end; a cloud that has more keeps its number.
+    /// Number of Gaussians at the end, or before the [`layer`](Self::layer); a cloud that has more keeps its number.
     pub gaussians: usize,
     /// Learning rates of 2,000 steps or more, at the start. Of fewer steps, scale, rotation and opacity have higher ones: up to
     /// three times these, for 400 steps or less.
     pub rates: Rates,
     /// Longest side, in pixels, at which views are compared; larger ones are shrunk.
     pub render_size: u32,
-    /// Part of the steps, the last ones, that have one layer of flat Gaussians where photos see the object's surface, and up to twice as
-    /// many in all. 0: no layer. 0..1
+    /// Part of the steps, the last ones, that have one layer of flat Gaussians where photos see the object's surface: up to
+    /// [`gaussians`](Self::gaussians) more. 0: no layer. 0..1
     pub layer: f64,
     /// Part of the other steps, the first ones, that compare views at [`coarse_size`](Self::coarse_size): what they see is coarse as yet. 0..1
     pub coarse: f64,
@@ -262,8 +262,6 @@ const BESIDE_WINDOWS: f64 = 1.5;
 
 /// What [`OptimizationConfig::layer`] is there.
 const LAYER: f64 = 0.25;
-/// Times as many Gaussians as without it, at most.
-const MORE: usize = 2;
 /// So many times as much anchors weigh beside the layer: they show what the steps before it made, from all around.
 const BESIDE_LAYER: f64 = 4.0;
 /// Learning rates of the centers beside the layer, at first and at the end: the surface is to stay.
@@ -307,11 +305,6 @@ impl OptimizationConfig {
             anchors: AnchorConfig { weight: BESIDE_WINDOWS * self.anchors.weight / detail as f64, ..self.anchors },
             ..self
         }
-    }
-
-    /// Most Gaussians at the end.
-    pub(crate) fn most(&self) -> usize {
-        if self.layer > 0.0 { self.gaussians.saturating_mul(MORE) } else { self.gaussians }
     }
 
     /// Anchors of the steps with the layer.
@@ -409,11 +402,10 @@ mod tests {
             (400, 16_384, 512, 1.5 * 0.1 / 2.0)
         );
         assert_eq!((two.layer, two.coarse, two.coarse_size, two.window), (0.25, 0.6, 256, 0.6));
-        assert_eq!((config.most(), two.most()), (8192, 32_768));
         assert!((two.anchors_of_layer().weight - 0.3).abs() < 1e-12);
         let four = config.clone().detailed(4, 4000);
         assert_eq!((four.steps, four.gaussians, four.render_size, four.coarse_size), (800, 32_768, 1024, 512));
-        assert_eq!((four.most(), four.anchors.weight), (65_536, 1.5 * 0.1 / 4.0));
+        assert_eq!(four.anchors.weight, 1.5 * 0.1 / 4.0);
         // No more than photos show.
         assert_eq!(config.clone().detailed(4, 512), two);
         assert_eq!(config.clone().detailed(4, 257), two);

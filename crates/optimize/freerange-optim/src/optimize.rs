@@ -71,7 +71,8 @@ pub fn optimize<'a>(
         return Ok(result);
     }
     let anchors = Anchors::new(std::slice::from_ref(&result), small, &config.anchors_of_layer())?;
-    let layered = layered(&result, &targets, config.most())?;
+    let most = config.gaussians.max(result.len()).saturating_add(config.gaussians);
+    let layered = layered(&result, &targets, most)?;
     let fit = config.fit_of_layer(layered.len(), with_layer);
     let mut further = Further::new(&anchors, silhouettes.as_ref(), config.seed);
     let more = |cloud: &Gaussians, background| further.objectives(cloud, background);

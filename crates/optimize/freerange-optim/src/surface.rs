@@ -12,6 +12,8 @@ use glam::{DMat3, DQuat, DVec3};
 use image::RgbaImage;
 use rayon::prelude::*;
 
+/// Photos that place Gaussians, spread evenly over all: each is compared with each.
+const MOST_PHOTOS: usize = 48;
 /// Distance in pixels between the Gaussians that a photo places, at least.
 const SPACING: f64 = 3.0;
 /// Standard deviations of a Gaussian along the surface and across it, in distances between two.
@@ -45,7 +47,9 @@ const SOLID: u8 = 250;
 /// Each photo places Gaussians in a grid of its pixels where no other photo looks more directly at the surface. The grid is
 /// made coarser until there are few enough. Nothing is placed at outlines, at grazing angles and where the depths are rough.
 pub(crate) fn layered(set: &Gaussians, photos: &Targets, most: usize) -> Result<Gaussians, FitError> {
-    let seen = (0..photos.photos).map(|i| Photo::new(set, photos, i)).collect::<Result<Vec<_>, _>>()?;
+    let asked = photos.photos.min(MOST_PHOTOS);
+    let chosen = (0..asked).map(|k| k * photos.photos / asked);
+    let seen = chosen.map(|i| Photo::new(set, photos, i)).collect::<Result<Vec<_>, _>>()?;
     let longest = seen.iter().map(|photo| photo.camera.width.max(photo.camera.height)).max().unwrap_or(0);
     let mut spacing = SPACING;
     while spacing <= f64::from(longest) {
