@@ -269,7 +269,8 @@ const LAYER_MEAN_RATES: [f64; 2] = [1e-4, 1e-5];
 
 impl OptimizationConfig {
     /// These settings, which are for up to four photos, for so many: more steps, five times as many for sixteen, more of their pixels, up
-    /// to 512, and less weight of anchors, since more of the object is seen. From sixteen photos on nothing changes any more.
+    /// to 512, less weight of anchors, since more of the object is seen, and no layer: where photos overlap they agree on the surface
+    /// themselves. From sixteen photos on nothing changes any more.
     #[must_use]
     pub fn for_photos(self, photos: usize) -> Self {
         let photos = photos.clamp(PHOTOS, MOST_PHOTOS);
@@ -279,6 +280,7 @@ impl OptimizationConfig {
             steps: (self.steps as f64 * MOST_STEPS.powf(more.ln() / most.ln())).round() as usize,
             render_size: grown(self.render_size),
             anchors: AnchorConfig { weight: self.anchors.weight / more.powf(1.5), ..self.anchors },
+            layer: if photos > PHOTOS { 0.0 } else { self.layer },
             ..self
         }
     }
@@ -374,6 +376,8 @@ mod tests {
         let detailed = config.clone().detailed(2, 4000).for_photos(8);
         assert_eq!((detailed.steps, detailed.render_size, detailed.gaussians), (894, 512, 16_384));
         assert_eq!(config.clone().detailed(4, 4000).for_photos(16).render_size, 1024);
+        let layers = [2, 4, 5, 16].map(|photos| config.clone().detailed(2, 512).for_photos(photos).layer);
+        assert_eq!(layers, [0.25, 0.25, 0.0, 0.0]);
     }
 
     #[test]
